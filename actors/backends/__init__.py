@@ -1,0 +1,1 @@
+"""Simulator backends, one folder each; nothing outside a folder imports its simulator."""

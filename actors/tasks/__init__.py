@@ -1,0 +1,1 @@
+"""The tasks of the paper: their situations, scenes and readings of success."""

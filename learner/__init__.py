@@ -1,0 +1,1 @@
+"""The network of Hwang et al. (2015), its training, and the process that trains it."""

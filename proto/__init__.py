@@ -1,0 +1,1 @@
+"""What crosses a process boundary: configuration, messages, keys, files and the bus."""

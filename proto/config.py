@@ -1,0 +1,226 @@
+"""The configuration of a run: YAML, checked field by field, unknown keys refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from proto.errors import UserError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=1)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class RunConfig(_Section):
+    """The run: a folder with its config, checkpoints, tutoring, rollouts, evaluation and logs."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = "experiment1"
+    folder: Path = Path("runs")
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
+
+
+class HubConfig(_Section):
+    """The hub that all processes connect to."""
+
+    endpoint: Annotated[str, Field(pattern=r"^(tcp|tls|udp|quic|ws)/.+:\d+$")] = (
+        "tcp/127.0.0.1:7447"
+    )
+    shared_memory: bool = False
+
+
+class TaskConfig(_Section):
+    """Which task is tutored and tested."""
+
+    name: Literal["experiment1"] = "experiment1"
+
+
+class SimulatorConfig(_Section):
+    """Which simulator plays the scenes, and how finely."""
+
+    backend: str = "sapien"
+    control_period_s: Positive = 0.1
+    physics_period_s: Positive = 0.005
+    render: bool = True
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps in one control step."""
+        return round(self.control_period_s / self.physics_period_s)
+
+    @model_validator(mode="after")
+    def _periods_fit(self) -> Self:
+        if abs(self.substeps * self.physics_period_s - self.control_period_s) > 1e-9:
+            raise ValueError("control_period_s must be a whole multiple of physics_period_s")
+        return self
+
+
+class TutorConfig(_Section):
+    """How the tutor executes its plan when a case is tutored again."""
+
+    repeats: Count = 4
+    noise_deg: NotNegative = 1.0
+    noise_correlation_steps: Positive = 20.0
+
+
+class SubnetConfig(_Section):
+    """A subnet of leaky integrators without space (PFC, M_S, M_F)."""
+
+    units: Count
+    tau: Annotated[float, Field(ge=1)]
+
+
+class MapsConfig(_Section):
+    """A convolutional subnet (V_F, V_S): maps, kernel of its input (width, height), stride."""
+
+    maps: Count
+    kernel: tuple[Count, Count]
+    stride: Count
+    tau: Annotated[float, Field(ge=1)]
+
+
+class NetworkConfig(_Section):
+    """VMDNN (paper, section 4.1)."""
+
+    image: tuple[Count, Count] = (64, 48)
+    mstnn_fast: MapsConfig = MapsConfig(maps=3, kernel=(22, 14), stride=2, tau=2)
+    mstnn_slow: MapsConfig = MapsConfig(maps=6, kernel=(8, 6), stride=2, tau=30)
+    pfc: SubnetConfig = SubnetConfig(units=20, tau=150)
+    mtrnn_slow: SubnetConfig = SubnetConfig(units=30, tau=10)
+    mtrnn_fast: SubnetConfig = SubnetConfig(units=50, tau=2)
+    softmax_units: Annotated[int, Field(ge=2)] = 10
+    code_margin: NotNegative = 0.2
+    code_width: Positive = 0.6
+    update_order: Literal["bottom_up", "literal"] = "bottom_up"
+
+
+class PretrainingConfig(_Section):
+    """Pre-training of the MSTNN as a delayed-response classifier (section 3.3)."""
+
+    epochs: Annotated[int, Field(ge=0)] = 300
+    rate: Positive = 2e-3
+    batch: Count = 15
+
+
+class LearnerConfig(_Section):
+    """Coupled training of PFC, M_S and M_F, and when policies are published."""
+
+    epochs: Count = 2500
+    rate: Positive = 3e-3
+    schedule: Literal["constant", "cosine"] = "cosine"
+    warmup_epochs: Annotated[int, Field(ge=0)] = 50
+    batch: Count = 60
+    clip_norm: Positive | None = 1.0
+    initial_range: Positive = 0.1
+    initial_range_pfc_input: Positive = 0.2
+    checkpoint_every_epochs: Count = 100
+    publish_every_epochs: Count = 250
+    threads: Count = 1
+    pretraining: PretrainingConfig = PretrainingConfig()
+
+
+class EvaluatorConfig(_Section):
+    """Trials of unlearned situations, counted for each policy version."""
+
+    trials_per_policy: Count = 52
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1000
+    lease_s: Positive = 60.0
+
+
+class RecorderConfig(_Section):
+    """What is kept of the rollouts on disk."""
+
+    rollouts: bool = True
+
+
+class DoneConfig(_Section):
+    """When a run started by deploy/run_local.sh is finished; all conditions must hold."""
+
+    policy_versions: Count | None = None
+    trials: Count | None = None
+
+
+class Config(_Section):
+    """Everything a run depends on."""
+
+    run: RunConfig = RunConfig()
+    hub: HubConfig = HubConfig()
+    task: TaskConfig = TaskConfig()
+    simulator: SimulatorConfig = SimulatorConfig()
+    tutor: TutorConfig = TutorConfig()
+    network: NetworkConfig = NetworkConfig()
+    learner: LearnerConfig = LearnerConfig()
+    evaluator: EvaluatorConfig = EvaluatorConfig()
+    recorder: RecorderConfig = RecorderConfig()
+    done: DoneConfig = DoneConfig()
+
+    @property
+    def run_folder(self) -> Path:
+        """Folder of the run."""
+        return self.run.folder / self.run.name
+
+    def digest(self) -> str:
+        """Twelve hexadecimal digits that tell one effective configuration from another."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    def save(self, path: Path) -> None:
+        """Write the effective configuration as YAML."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False))
+
+
+def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
+    """Read a YAML file (None: all defaults) and apply `key.path=value` overrides.
+
+    Raises:
+        UserError: missing file, broken YAML, unknown key, wrong type or value out of range.
+    """
+    values: dict[str, Any] = {}
+    if path is not None:
+        try:
+            values = yaml.safe_load(path.read_text()) or {}
+        except FileNotFoundError as error:
+            raise UserError(f"config file {path} does not exist") from error
+        except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+            raise UserError(f"config file {path} cannot be read: {error}") from error
+        if not isinstance(values, dict):
+            raise UserError(f"config file {path}: expected `section: ...` lines at the top level")
+    for override in overrides:
+        _apply(values, override)
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        where = f"config file {path}" if path else "config"
+        problems = "\n".join(
+            f"  {'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"
+            f" (got {problem['input']!r})"
+            for problem in error.errors()
+        )
+        raise UserError(f"{where} is not valid:\n{problems}") from error
+
+
+def _apply(values: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    if not separator or not key:
+        raise UserError(f"--set {override!r}: expected key=value, such as learner.rate=1e-3")
+    *sections, last = key.split(".")
+    for section in sections:
+        inner = values.setdefault(section, {})
+        if not isinstance(inner, dict):
+            raise UserError(f"--set {override!r}: {section} is a value, not a section")
+        values = inner
+    try:
+        values[last] = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise UserError(f"--set {override!r}: {text!r} is not a YAML value") from error

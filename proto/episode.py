@@ -1,0 +1,121 @@
+"""One episode: what was seen, told, done, and how it ended. The unit of tutoring and evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+
+
+class Kind(StrEnum):
+    """Why an episode was played."""
+
+    TUTORING = "tutoring"
+    TRIAL = "trial"
+    PRACTICE = "practice"
+
+
+class Reason(StrEnum):
+    """Why an episode fell short of `precise`; the first that applies, in this order."""
+
+    NONE = "none"
+    TOUCHED_OBSTACLE = "touched_obstacle"
+    MOVED_OBJECT = "moved_object"
+    NEVER_CLOSED = "never_closed"
+    NOT_LIFTED = "not_lifted"
+    IMPRECISE = "imprecise"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an episode ended, in the three readings of success.
+
+    Attributes:
+        lenient: the object ended more than 5 cm above its start.
+        strict: lifted and held, obstacle untouched, object at most 10 mm moved and 5 degrees
+            turned before the hand closed.
+        precise: strict, and the hand's pose to the object was right when it closed.
+        reason: why it was not precise.
+        lifted_m: height of the object above its start at the end (m).
+        moved_mm: how far the object was moved before the hand closed.
+        turned_deg: how far the object was turned before the hand closed.
+        yaw_error_deg: yaw of the hand's grasp axis against the object's when it closed.
+        along_mm: offset of the grasp centre along the object's long axis when the hand closed.
+        across_mm: offset across it.
+        closed_at: control step at which the hand closed, or -1.
+        obstacle_touched_at: first control step in which the obstacle was touched, or -1.
+    """
+
+    lenient: bool
+    strict: bool
+    precise: bool
+    reason: Reason
+    lifted_m: float
+    moved_mm: float
+    turned_deg: float
+    yaw_error_deg: float
+    along_mm: float
+    across_mm: float
+    closed_at: int
+    obstacle_touched_at: int
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode of T control steps.
+
+    At step t the robot sees images[t], is told actions[t], and moves for one control period.
+
+    Attributes:
+        id: random hexadecimal id, unique.
+        kind: why it was played.
+        task: name of the task.
+        situation: the situation's values by name, in the paper's task frame.
+        seed: seed of everything random in it.
+        actor: id of the process that played it.
+        backend: name of the simulator.
+        policy: name of the policy.
+        policy_version: version of the policy, 0 for one never trained.
+        config_digest: digest of the effective configuration.
+        images: (T, 48, 64) uint8, the network's grey picture before normalization.
+        actions: (T, 11) float32, what the robot was told (units of `proto.action`).
+        targets: (T, 11) float32, what the policy meant; the clean plan where noise was added to
+            the actions, else equal to them.
+        joints_deg: (T, 18) float32, measured before the action: neck, arm, hand motors.
+        phases: (T,) uint8, subtask 1..8 of the paper's Experiment I.
+        body_names: names of the bodies, B of them.
+        body_poses: (T, B, 7) float32, position (m) and quaternion (w first) in the world frame.
+        outcome: how it ended.
+        outputs: (T, 110) float32, softmax outputs of the network, or None.
+    """
+
+    id: str
+    kind: Kind
+    task: str
+    situation: Mapping[str, float]
+    seed: int
+    actor: str
+    backend: str
+    policy: str
+    policy_version: int
+    config_digest: str
+    images: Image
+    actions: Floats
+    targets: Floats
+    joints_deg: Floats
+    phases: NDArray[np.uint8]
+    body_names: tuple[str, ...]
+    body_poses: Floats
+    outcome: Outcome
+    outputs: Floats | None = field(default=None)
+
+    @property
+    def steps(self) -> int:
+        """Number of control steps T."""
+        return len(self.actions)

@@ -1,0 +1,1 @@
+"""What serves: hub, evaluator, recorder, watch, and the command line."""

@@ -1,0 +1,75 @@
+"""The `vmdnn` command: one subcommand for each process and tool."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import Final, Protocol, cast
+
+from proto.errors import UserError
+
+
+class Command(Protocol):
+    """A module with one subcommand."""
+
+    def configure(self, parser: argparse.ArgumentParser) -> None:
+        """Add the subcommand's arguments."""
+
+    def run(self, arguments: argparse.Namespace) -> int:
+        """Do it; the result is the exit status."""
+
+
+# Each module is imported only when its subcommand is asked for: `vmdnn hub` needs no torch.
+COMMANDS: Final[dict[str, tuple[str, str]]] = {
+    "hub": ("services.commands.hub", "the router that all processes connect to"),
+    "learner": ("services.commands.learner", "store tutoring, train, publish policies"),
+    "actor": ("services.commands.actor", "play scenes with the newest policy"),
+    "evaluator": ("services.commands.evaluator", "hand out trials and count success"),
+    "recorder": ("services.commands.recorder", "record every episode as MCAP"),
+    "watch": ("services.commands.watch", "see what all processes are doing"),
+    "tutor": ("services.commands.tutor", "record tutoring sequences, without the bus"),
+    "train": ("services.commands.train", "train a network on recorded sequences"),
+    "evaluate": ("services.commands.evaluate", "test a policy on unlearned situations"),
+    "replay": ("services.commands.replay", "make a video of a recorded episode"),
+    "recover": ("services.commands.recover", "repair an MCAP file that was cut off"),
+    "inspect": ("services.commands.inspect", "print the network's subnets, or a checkpoint"),
+    "bench": ("services.commands.bench", "measure speed on this machine"),
+    "doctor": ("services.commands.doctor", "check this machine and say what to do"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one subcommand and return its exit status; bad input prints a message and gives 2."""
+    parser = argparse.ArgumentParser(
+        prog="vmdnn",
+        description="Tutor simulated iCub humanoids with VMDNN, from one laptop to a cluster.",
+        epilog="`vmdnn COMMAND --help` explains a command.",
+    )
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    words = list(sys.argv[1:] if argv is None else argv)
+    asked = next((word for word in words if not word.startswith("-")), None)
+    for name, (module, summary) in COMMANDS.items():
+        subparser = subparsers.add_parser(
+            name,
+            help=summary,
+            description=summary[0].upper() + summary[1:] + ".",
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+        if name == asked:
+            command = cast("Command", importlib.import_module(module))
+            command.configure(subparser)
+            subparser.set_defaults(run=command.run)
+    arguments = parser.parse_args(words)
+    try:
+        return int(arguments.run(arguments))
+    except UserError as error:
+        print(f"vmdnn {arguments.command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""One module for each subcommand of `vmdnn`: `configure(parser)` and `run(arguments)`."""
