@@ -131,9 +131,15 @@ class StepReport:
 
 
 class Simulator(Protocol):
-    """A simulator that can play scenes; made once, reset for each episode."""
+    """A simulator that can play scenes; made once, reset for each episode.
+
+    Attributes:
+        name: what it is called in the config and in recordings.
+        control_period_s: how long one control step lasts (s).
+    """
 
     name: str
+    control_period_s: float
 
     def reset(self, scene: Scene) -> None:
         """Replace whatever was there with `scene`; the same scene gives the same episode."""

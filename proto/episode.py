@@ -93,6 +93,7 @@ class Episode:
         body_poses: (T, B, 7) float32, position (m) and quaternion (w first) in the world frame.
         outcome: how it ended.
         outputs: (T, 110) float32, softmax outputs of the network, or None.
+        control_period_s: time from one control step to the next (s).
     """
 
     id: str
@@ -114,6 +115,7 @@ class Episode:
     body_poses: Floats
     outcome: Outcome
     outputs: Floats | None = field(default=None)
+    control_period_s: float = 0.1
 
     @property
     def steps(self) -> int:
