@@ -159,7 +159,8 @@ CLOSED_DEG: Final = np.array([40.0, 85.0, 62.0, 64.0, 38.0, 36.0, 38.0, 36.0, 75
 
 def motors_from_grasp(level: float) -> NDArray[np.float64]:
     """Motor angles (9,) in degrees for a grasp level from 1 (open) to 10 (closed), linear."""
-    return OPEN_DEG + (CLOSED_DEG - OPEN_DEG) * (min(max(level, 1.0), 10.0) - 1.0) / 9.0
+    fraction = (np.clip(level, 1.0, 10.0) - 1.0) / 9.0
+    return np.asarray(OPEN_DEG + (CLOSED_DEG - OPEN_DEG) * fraction, dtype=np.float64)
 
 
 def closing_fraction(motors_deg: NDArray[np.float64]) -> float:

@@ -43,8 +43,8 @@ def frame_pose(model, frame, angles):
 
 
 def test_limits_agree_with_the_action():
-    assert NECK_JOINTS == tuple(value.name for value in ACTION_VALUES[NECK])
-    assert ARM_JOINTS == tuple(value.name for value in ACTION_VALUES[ARM])
+    assert tuple(value.name for value in ACTION_VALUES[NECK]) == NECK_JOINTS
+    assert tuple(value.name for value in ACTION_VALUES[ARM]) == ARM_JOINTS
     for value in ACTION_VALUES[: ARM.stop]:
         assert JOINT_LIMITS_DEG[value.name] == (value.minimum, value.maximum)
 
