@@ -47,5 +47,20 @@ ARM: Final = slice(2, 9)
 GRASP: Final = 9
 FOCUS: Final = 10
 
+JOINT_NAMES: Final[tuple[str, ...]] = (
+    *ACTION_NAMES[NECK],
+    *ACTION_NAMES[ARM],
+    "hand_finger",
+    "thumb_oppose",
+    "thumb_proximal",
+    "thumb_distal",
+    "index_proximal",
+    "index_distal",
+    "middle_proximal",
+    "middle_distal",
+    "pinky",
+)
+"""The measured joints, in the order of an episode's `joints_deg`: neck, arm, hand motors."""
+
 IMAGE_HEIGHT: Final = 48
 IMAGE_WIDTH: Final = 64
