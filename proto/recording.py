@@ -52,7 +52,15 @@ TOPICS: Final[Mapping[str, type[Message]]] = {
 
 # A kill while an episode is written costs at most one chunk, some ten steps.
 CHUNK_BYTES: Final = 64 * 1024
-DAMAGE: Final = (McapError, ZstdError, struct.error, ValueError, KeyError, MemoryError)
+DAMAGE: Final = (
+    McapError,
+    ZstdError,
+    struct.error,
+    ValueError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+)
 """What reading the records of a file that is cut off, or damaged otherwise, raises."""
 
 

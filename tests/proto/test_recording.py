@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -25,34 +26,7 @@ from sim_assets.hand import MOTOR_NAMES
 OUTPUTS = 110
 
 
-def an_episode(steps: int = 40) -> Episode:
-    """An episode that is different in every step."""
-    random = np.random.default_rng(steps)
-
-    def walk(*shape: int) -> np.ndarray:
-        return np.cumsum(random.normal(size=shape), axis=0).astype(np.float32)
-
-    return Episode(
-        id="0123456789abcdef",
-        kind=Kind.TUTORING,
-        task="experiment1",
-        situation={"object_y": 0.25, "object_yaw": -22.5, "obstacle_x": -0.27},
-        seed=3001,
-        actor="local",
-        backend="sapien",
-        policy="tutor",
-        policy_version=0,
-        config_digest="c0ffee",
-        images=random.integers(0, 256, (steps, IMAGE_HEIGHT, IMAGE_WIDTH), dtype=np.uint8),
-        actions=walk(steps, ACTION_SIZE),
-        targets=walk(steps, ACTION_SIZE),
-        joints_deg=walk(steps, len(JOINT_NAMES)),
-        phases=np.linspace(1, 8, steps).astype(np.uint8),
-        body_names=("object", "obstacle"),
-        body_poses=walk(steps, 2, 7),
-        outcome=Outcome(True, True, False, Reason.IMPRECISE, 0.1, 1, 2, 11, 4, 5, 80, -1),
-        outputs=np.abs(walk(steps, OUTPUTS)),
-    )
+MakeEpisode = Callable[..., Episode]
 
 
 def floats(*shape: int) -> st.SearchStrategy[np.ndarray]:
@@ -126,9 +100,9 @@ def test_joint_names_agree_with_the_hand() -> None:
     assert len(JOINT_NAMES) == 18
 
 
-def test_another_mcap_reader_understands_it(tmp_path: Path) -> None:
+def test_another_mcap_reader_understands_it(tmp_path: Path, make_episode: MakeEpisode) -> None:
     """With nothing but the file: index, schemas, times and metadata, as Foxglove reads them."""
-    path, episode = tmp_path / "episode.mcap", an_episode()
+    path, episode = tmp_path / "episode.mcap", make_episode()
     write_episode(path, episode)
     seen: dict[str, list[Message]] = {}
     with path.open("rb") as stream:
@@ -166,10 +140,10 @@ def test_another_mcap_reader_understands_it(tmp_path: Path) -> None:
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_a_file_cut_off_anywhere_is_refused(
-    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+    data: st.DataObject, make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("cut") / "episode.mcap"
-    write_episode(path, an_episode())
+    write_episode(path, make_episode())
     whole = path.read_bytes()
     path.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
     with pytest.raises(UserError, match=rf"vmdnn recover {path}"):
@@ -179,9 +153,9 @@ def test_a_file_cut_off_anywhere_is_refused(
 @settings(max_examples=150, deadline=None)
 @given(data=st.data())
 def test_a_flipped_byte_is_refused_or_harmless(
-    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+    data: st.DataObject, make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    path, episode = tmp_path_factory.mktemp("flip") / "episode.mcap", an_episode(12)
+    path, episode = tmp_path_factory.mktemp("flip") / "episode.mcap", make_episode(12)
     write_episode(path, episode)
     damaged = bytearray(path.read_bytes())
     damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
@@ -210,18 +184,18 @@ def test_what_is_no_recording_is_named(tmp_path: Path) -> None:
         read_episode(foreign)
 
 
-def test_a_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
+def test_a_failed_write_keeps_the_old_file(tmp_path: Path, make_episode: MakeEpisode) -> None:
     path = tmp_path / "episode.mcap"
-    write_episode(path, an_episode())
+    write_episode(path, make_episode())
     before = path.read_bytes()
-    broken = replace(an_episode(), joints_deg=an_episode().joints_deg[:, :5])
+    broken = make_episode(joints_deg=make_episode().joints_deg[:, :5])
     with pytest.raises(ValueError, match="shorter"):
         write_episode(path, broken)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path, make_episode: MakeEpisode) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be written"):
-        write_episode(tmp_path / "file" / "episode.mcap", an_episode())
+        write_episode(tmp_path / "file" / "episode.mcap", make_episode())

@@ -1,0 +1,31 @@
+"""`vmdnn recover`: save what is whole of an MCAP file that was cut off."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from proto.recovery import recover
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the subcommand's arguments."""
+    parser.add_argument("file", type=Path, help="MCAP file, or the .part file that a kill left")
+    parser.add_argument(
+        "--out", type=Path, help="where to write what is whole; without it, in place of the file"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Recover, and say how much was kept."""
+    found = recover(arguments.file, arguments.out)
+    target = arguments.out or arguments.file
+    kept = f"{found.messages} messages"
+    if found.steps_played is not None:
+        kept += f", {found.steps} of {found.steps_played} steps"
+    if found.intact:
+        copied = "" if arguments.out is None else f"; copied to {target}"
+        print(f"{arguments.file} is whole ({kept}){copied}")
+    else:
+        print(f"{target}: kept {kept}")
+    return 0

@@ -1,0 +1,49 @@
+"""What several folders of tests need."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
+from proto.episode import Episode, Kind, Outcome, Reason
+
+
+@pytest.fixture(scope="session")
+def make_episode() -> Callable[..., Episode]:
+    """Make an episode that is different in every step; fields can be given by name."""
+
+    def make(steps: int = 40, **given: Any) -> Episode:
+        random = np.random.default_rng(steps)
+
+        def walk(*shape: int) -> np.ndarray:
+            return np.cumsum(random.normal(size=shape), axis=0).astype(np.float32)
+
+        episode = Episode(
+            id="0123456789abcdef",
+            kind=Kind.TUTORING,
+            task="experiment1",
+            situation={"object_y": 0.25, "object_yaw": -22.5, "obstacle_x": -0.27},
+            seed=3001,
+            actor="local",
+            backend="sapien",
+            policy="tutor",
+            policy_version=0,
+            config_digest="c0ffee",
+            images=random.integers(0, 256, (steps, IMAGE_HEIGHT, IMAGE_WIDTH), dtype=np.uint8),
+            actions=walk(steps, ACTION_SIZE),
+            targets=walk(steps, ACTION_SIZE),
+            joints_deg=walk(steps, len(JOINT_NAMES)),
+            phases=np.linspace(1, 8, steps).astype(np.uint8),
+            body_names=("object", "obstacle"),
+            body_poses=walk(steps, 2, 7),
+            outcome=Outcome(True, True, False, Reason.IMPRECISE, 0.1, 1, 2, 11, 4, 5, 80, -1),
+            outputs=np.abs(walk(steps, 110)),
+        )
+        return replace(episode, **given)
+
+    return make
