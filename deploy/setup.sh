@@ -1,0 +1,144 @@
+# shellcheck shell=bash
+# Sourced by run_local.sh and test.sh. `setup` brings this checkout to where it can run: Python, the
+# locked packages in .venv, and a graphics driver that can render. What is there already is left
+# alone, so that a second call takes about a second.
+
+ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
+VENV="$ROOT/.venv"
+LOCK="$ROOT/deploy/requirements.lock"
+
+setup() {
+    setup_python
+    setup_packages
+    setup_graphics
+}
+
+say() { printf 'setup: %s\n' "$*" >&2; }
+
+fail() {
+    say "$@"
+    exit 1
+}
+
+# --- Python -----------------------------------------------------------------------------------
+
+# Prints the first Python for which the lock was made and that can make environments.
+find_python() {
+    local python
+    for python in python3 python3.12 python3.11; do
+        if "$python" -c 'import sys, venv, ensurepip
+sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null; then
+            command -v "$python"
+            return
+        fi
+    done
+    return 1
+}
+
+setup_python() {
+    [[ -x "$VENV/bin/python" ]] && return
+    if ! PYTHON="$(find_python)"; then
+        can_install || fail "Python 3.11 or 3.12 with venv is needed; as root: $(apt_line python3 python3-venv)"
+        apt_install python3 python3-venv
+        PYTHON="$(find_python)" || fail "Python 3.11 or 3.12 is needed, but this system's python3 is" \
+            "$(python3 --version 2>&1); install one of them and start again"
+    fi
+    say "making .venv with $("$PYTHON" --version)"
+    "$PYTHON" -m venv "$VENV"
+}
+
+# --- packages ---------------------------------------------------------------------------------
+
+setup_packages() {
+    local stamp="$VENV/installed" digest
+    digest="$(cat "$LOCK" "$ROOT/pyproject.toml" | sha256sum)"
+    [[ -f "$stamp" && "$(<"$stamp")" == "$digest" ]] && return
+    say "installing $(grep -c == "$LOCK") packages into .venv (takes minutes the first time)"
+    # torch comes first and by itself: its build for this machine decides what else it needs.
+    pip_install --constraint "$LOCK" torch
+    pip_install --no-deps --requirement "$LOCK"
+    pip_install --no-deps --no-build-isolation --editable "$ROOT"
+    setup_libraries
+    printf '%s\n' "$digest" >"$stamp"
+}
+
+pip_install() {
+    "$VENV/bin/python" -m pip install --quiet --no-input --disable-pip-version-check \
+        --root-user-action=ignore "$@" || fail "pip could not install; is the network there?"
+}
+
+# Two of the packages expect shared libraries that a bare system lacks: pin OpenMP, sapien X11.
+setup_libraries() {
+    imports && return
+    local libraries=(libgomp1 libx11-6)
+    can_install || fail "shared libraries are missing; as root: $(apt_line "${libraries[@]}")"
+    apt_install "${libraries[@]}"
+    imports || fail "the packages cannot be imported; see above"
+}
+
+imports() { "$VENV/bin/python" -W ignore -c 'import cv2, pinocchio, sapien'; }
+
+# --- graphics ---------------------------------------------------------------------------------
+
+# SAPIEN needs a Vulkan driver with VK_KHR_external_semaphore_fd: NVIDIA's, or Mesa's from 24.3 on.
+setup_graphics() {
+    can_render && return
+    local packages=(mesa-vulkan-drivers libvulkan1) release=()
+    if [[ "$(system)" == debian-12 ]]; then
+        release=(-t bookworm-backports) # Debian 12 itself has Mesa 22.3
+    fi
+    if ! can_install; then
+        explain_graphics || true
+        fail "no graphics driver that can render; as root: $(apt_line "${release[@]}" "${packages[@]}")"
+    fi
+    say "installing the graphics driver (${packages[*]})"
+    if [[ "$(system)" == debian-12 ]]; then add_backports; fi
+    apt_install "${release[@]}" "${packages[@]}"
+    explain_graphics || fail "the graphics driver still cannot render; see above"
+}
+
+can_render() { explain_graphics >/dev/null 2>&1; }
+
+# Succeeds where SAPIEN can render; else says why not and what to do.
+explain_graphics() { "$VENV/bin/python" -m actors.backends.sapien.graphics >&2; }
+
+# Takes the mirror from which this machine has its Debian 12, whatever that is.
+add_backports() {
+    local list=/etc/apt/sources.list.d/bookworm-backports.list
+    if apt-get indextargets --format '$(RELEASE)' | grep -qx bookworm-backports; then return; fi
+    local mirror
+    mirror="$(apt-get indextargets --format '$(RELEASE) $(REPO_URI)' | awk '$1 == "bookworm" { print $2; exit }')"
+    [[ -n "$mirror" ]] || fail "this machine's package sources name no mirror of Debian 12; add bookworm-backports by hand"
+    echo "deb $mirror bookworm-backports main" | as_root tee "$list" >/dev/null
+    say "added $list"
+}
+
+# --- the system's packages --------------------------------------------------------------------
+
+# Prints the system's name and version, such as debian-12 or ubuntu-24.04.
+system() { (. /etc/os-release 2>/dev/null && echo "${ID:-unknown}-${VERSION_ID:-}"); }
+
+can_install() {
+    command -v apt-get >/dev/null || return 1
+    [[ $EUID -eq 0 ]] && return
+    # Without a terminal nobody can type a password.
+    if [[ -t 0 ]]; then command -v sudo >/dev/null; else sudo -n true 2>/dev/null; fi
+}
+
+as_root() {
+    if [[ $EUID -eq 0 ]]; then "$@"; else sudo "$@"; fi
+}
+
+apt_line() { echo "apt-get install --no-install-recommends $*"; }
+
+apt_install() {
+    local log
+    log="$(mktemp)"
+    if ! { as_root apt-get update -qq &&
+        as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "$@"; } \
+        </dev/null >"$log" 2>&1; then
+        tail -n 20 "$log" >&2
+        fail "the packages could not be installed: $*"
+    fi
+    rm -f "$log"
+}

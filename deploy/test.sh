@@ -1,0 +1,12 @@
+#!/usr/bin/env bash
+# Sets up this checkout as run_local.sh does, then checks it: format, lint, types and tests.
+# Arguments go to pytest: `deploy/test.sh -m slow`, `deploy/test.sh tests/learner -k gradient`.
+set -euo pipefail
+
+source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
+setup
+cd "$ROOT"
+.venv/bin/ruff format --check .
+.venv/bin/ruff check .
+.venv/bin/mypy
+exec .venv/bin/python -m pytest "$@"
