@@ -73,7 +73,7 @@ def test_a_file_cut_off_anywhere_keeps_its_whole_steps(
 def test_a_process_killed_while_recording_leaves_a_recoverable_file(
     recording: bytes, episode: Episode, tmp_path: Path
 ) -> None:
-    """The other process would need many seconds to write the whole episode; it is killed long before."""
+    """The other process would need many seconds to write it all; it is killed long before."""
     source, target = tmp_path / "short.mcap", tmp_path / "long.mcap"
     script = f"""
 from dataclasses import replace
