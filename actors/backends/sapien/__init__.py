@@ -1,0 +1,1 @@
+"""The SAPIEN backend: PhysX for the physics, Vulkan for the pictures."""

@@ -1,0 +1,172 @@
+"""The SAPIEN backend of `actors.simulator.Simulator`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+import sapien
+from numpy.typing import NDArray
+
+from actors.backends.sapien.stage import Stage, material
+from actors.backends.sapien.world import RobotBuilder, World, along
+from actors.simulator import (
+    EYE_HEIGHT,
+    Array,
+    Crop,
+    Image,
+    JointTargets,
+    Observation,
+    Pose,
+    Scene,
+    StepReport,
+)
+from proto.action import IMAGE_HEIGHT, IMAGE_WIDTH
+from proto.config import SimulatorConfig
+from sim_assets.hand import joints_from_motors, motors_from_joints
+from sim_assets.icub import EYE, Capsule, Collider, Cuboid, build_icub
+
+EYE_FOV_DEG: Final = 50.0
+"""Vertical field of view of the whole eye image."""
+SUPERSAMPLING: Final = 3
+"""Rendered pixels along each side of one pixel of the network's picture."""
+_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # Rec. 601
+_STATIC_LINKS: Final = frozenset({"root_link", "torso_1", "torso_2", "chest"})
+
+
+class SapienSimulator:
+    """Plays scenes in SAPIEN; see `actors.simulator.Simulator`.
+
+    With `config.render` false nothing graphical is touched and every observed image is black.
+    """
+
+    name = "sapien"
+
+    def __init__(self, config: SimulatorConfig) -> None:
+        self._config = config
+        self._model = build_icub()
+        self._builder = RobotBuilder(self._model)
+        self._eye_stage: Stage | None = None
+        self._outside_stage: Stage | None = None
+        self._scene: Scene | None = None
+        self._world_now: World | None = None
+        self._targets_deg = np.zeros(18)
+
+    def reset(self, scene: Scene) -> None:
+        """Replace whatever was there with `scene`; the same scene gives the same episode."""
+        self._scene = scene
+        self._targets_deg = _values(scene.start)
+        self._world_now = World(
+            self._builder,
+            self._model.joints,
+            scene,
+            _angles_rad(self._targets_deg),
+            self._config.physics_period_s,
+        )
+        for stage in (self._eye_stage, self._outside_stage):
+            if stage is not None:
+                stage.set_boxes(scene.boxes)
+
+    def step(self, targets: JointTargets) -> StepReport:
+        """Run one control period, moving the motors' targets linearly to `targets`.
+
+        Raises:
+            ValueError: a target is not a number.
+        """
+        before, after = self._targets_deg, _values(targets)
+        if not np.isfinite(after).all():
+            raise ValueError(f"joint targets must be finite, got {after}")
+        substeps = self._config.substeps
+        ramp = np.linspace(before, after, substeps + 1)[1:]
+        touches: set[tuple[str, str]] = set()
+        for values in ramp:
+            self._world.drive(_angles_rad(values))
+            self._world.step()
+            touches.update(self._world.touches())
+        self._targets_deg = after
+        return StepReport(frozenset(touches))
+
+    def observe(self, crop: Crop) -> Observation:
+        """Look through the left eye and feel the joints, now."""
+        return Observation(
+            image=self._grey(crop) if self._config.render else _black(),
+            joints_deg=self.joints_deg(),
+            finger_contact=self._world.finger_contact(),
+        )
+
+    def joints_deg(self) -> Array:
+        """Measured joint angles (18,) in degrees, without rendering."""
+        angles = np.rad2deg(self._world.joints_rad())
+        return np.concatenate([angles[:9], motors_from_joints(angles[9:])])
+
+    def bodies(self) -> Mapping[str, Pose]:
+        """True pose of every box and of every moving link of the robot, by name."""
+        return {
+            name: Pose(tuple(pose.p.tolist()), tuple(pose.q.tolist()))
+            for name, pose in self._world.poses().items()
+            if name not in _STATIC_LINKS
+        }
+
+    def close(self) -> None:
+        """Free what the simulator holds."""
+        self._world_now = self._eye_stage = self._outside_stage = None
+
+    @property
+    def _world(self) -> World:
+        if self._world_now is None:
+            raise RuntimeError("reset(scene) must come before everything else")
+        return self._world_now
+
+    def _grey(self, crop: Crop) -> Image:
+        """What the eye sees in a crop, averaged to (48, 64) uint8."""
+        factor = SUPERSAMPLING
+        colours = self._look(crop, IMAGE_WIDTH * factor, IMAGE_HEIGHT * factor)
+        fine = (colours @ _LUMA).reshape(IMAGE_HEIGHT, factor, IMAGE_WIDTH, factor)
+        grey: Image = np.rint(255.0 * fine.mean(axis=(1, 3))).astype(np.uint8)
+        return grey
+
+    def _look(self, crop: Crop, width: int, height: int) -> NDArray[np.float32]:
+        """Colours (height, width, 3) in 0..1 of what the eye sees in a crop."""
+        if self._eye_stage is None:
+            self._eye_stage = Stage(_collider_shapes(self._model.colliders))
+            assert self._scene is not None
+            self._eye_stage.set_boxes(self._scene.boxes)
+        poses = self._world.poses()
+        self._eye_stage.place(poses)
+        whole = EYE_HEIGHT / 2 / math.tan(math.radians(EYE_FOV_DEG / 2))
+        return self._eye_stage.picture(poses[EYE], width, height, whole * height / crop.height)
+
+
+def _black() -> Image:
+    return np.zeros((IMAGE_HEIGHT, IMAGE_WIDTH), dtype=np.uint8)
+
+
+def _values(targets: JointTargets) -> Array:
+    """The eighteen motor angles in degrees, in the order of `Observation.joints_deg`."""
+    return np.concatenate([targets.neck_deg, targets.arm_deg, targets.hand_deg])
+
+
+def _angles_rad(motors_deg: Array) -> Array:
+    """Angles (28,) of all joints for the motor angles (18,)."""
+    joints_deg = np.concatenate([motors_deg[:9], joints_from_motors(motors_deg[9:])])
+    return np.asarray(np.deg2rad(joints_deg), dtype=np.float64)
+
+
+def _collider_shapes(colliders: tuple[Collider, ...]) -> dict[str, list[Any]]:
+    shapes: dict[str, list[Any]] = {}
+    dark = material((0.2, 0.2, 0.22))
+    for collider in colliders:
+        match collider:
+            case Cuboid(_, centre_m, size_m):
+                shape = sapien.render.RenderShapeBox(np.array(size_m) / 2, dark)
+                shape.local_pose = sapien.Pose(centre_m)
+            case Capsule(_, start_m, end_m, radius_m) if start_m == end_m:
+                shape = sapien.render.RenderShapeSphere(radius_m, dark)
+            case Capsule(_, start_m, end_m, radius_m):
+                pose, length_m = along(np.array(start_m), np.array(end_m))
+                shape = sapien.render.RenderShapeCapsule(radius_m, length_m / 2, dark)
+                shape.local_pose = pose
+        shapes.setdefault(collider.link, []).append(shape)
+    return shapes

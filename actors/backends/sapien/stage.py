@@ -1,0 +1,121 @@
+"""Pictures of the world: a copy of its bodies that is moved to where they are when needed.
+
+Rendering is kept apart from the physics, so that a machine without any graphics driver can still
+run scenes, and the same world can be drawn in two ways: quickly for the robot's eye, and with all
+details from outside.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+import sapien
+from numpy.typing import NDArray
+from sapien import render
+
+from actors.simulator import Box
+
+Colours = NDArray[np.float32]
+
+# Mesa's software renderer otherwise starts a thread for each core, and actors fight for them.
+os.environ.setdefault("LP_NUM_THREADS", "0")
+
+AMBIENT: Final = 0.5
+SUN: Final = 0.6
+SUN_DIRECTION: Final = (0.3, 0.5, -1.0)
+NEAR_M: Final = 0.01
+FAR_M: Final = 5.0
+
+
+class Stage:
+    """Bodies made of shapes, lit by a fixed sun without shadows."""
+
+    def __init__(self, robot: Mapping[str, Sequence[Any]]) -> None:
+        """Set the stage with the robot, given as render shapes by link."""
+        render.set_camera_shader_dir("minimal")
+        self._system = render.RenderSystem()
+        self._scene = sapien.Scene([self._system])
+        self._system.set_ambient_light([AMBIENT] * 3)
+        self._scene.add_entity(_sun())
+        self._robot = {link: self._add(shapes) for link, shapes in robot.items()}
+        self._boxes: dict[str, sapien.Entity] = {}
+        self._cameras: dict[tuple[int, int], Any] = {}
+
+    def set_boxes(self, boxes: Iterable[Box]) -> None:
+        """Replace the boxes by those of another scene."""
+        for entity in self._boxes.values():
+            self._scene.remove_entity(entity)
+        self._boxes = {box.name: self._add([_box_shape(box)]) for box in boxes}
+
+    def place(self, poses: Mapping[str, sapien.Pose]) -> None:
+        """Move every body to its pose."""
+        for name, entity in self._robot.items():
+            entity.set_pose(poses[name])
+        for name, entity in self._boxes.items():
+            entity.set_pose(poses[name])
+
+    def picture(self, eye: sapien.Pose, width: int, height: int, focal: float) -> Colours:
+        """Take a picture (height, width, 3) float32 in 0..1 from a pose.
+
+        Args:
+            eye: x along the optical axis, y left, z up.
+            width: pixels across.
+            height: pixels down.
+            focal: focal length in these pixels.
+        """
+        camera = self._camera(width, height)
+        camera.entity.set_pose(eye)
+        camera.set_perspective_parameters(NEAR_M, FAR_M, focal, focal, width / 2, height / 2, 0.0)
+        self._system.step()
+        camera.take_picture()
+        return np.asarray(camera.get_picture("Color")[..., :3])
+
+    def _camera(self, width: int, height: int) -> Any:
+        if (width, height) not in self._cameras:
+            entity = sapien.Entity()
+            camera = render.RenderCameraComponent(width, height)
+            entity.add_component(camera)
+            self._scene.add_entity(entity)
+            self._cameras[width, height] = camera
+        return self._cameras[width, height]
+
+    def _add(self, shapes: Iterable[Any]) -> sapien.Entity:
+        entity = sapien.Entity()
+        body = render.RenderBodyComponent()
+        for shape in shapes:
+            body.attach(shape)
+        entity.add_component(body)
+        self._scene.add_entity(entity)
+        return entity
+
+
+def _sun() -> sapien.Entity:
+    entity = sapien.Entity()
+    light = render.RenderDirectionalLightComponent()
+    light.set_color([SUN] * 3)
+    light.disable_shadow()
+    entity.add_component(light)
+    entity.set_pose(_looking_along(np.array(SUN_DIRECTION)))
+    return entity
+
+
+def _looking_along(direction: NDArray[np.float64]) -> sapien.Pose:
+    """Pose at the origin, x along a direction that is not vertical, z as far up as can be."""
+    x = direction / np.linalg.norm(direction)
+    y = np.cross([0.0, 0.0, 1.0], x)
+    y /= np.linalg.norm(y)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
+    return sapien.Pose(matrix)
+
+
+def _box_shape(box: Box) -> Any:
+    return render.RenderShapeBox(np.array(box.size_m) / 2, material(box.colour))
+
+
+def material(colour: Sequence[float]) -> Any:
+    """A matt material of a colour in 0..1."""
+    return render.RenderMaterial(base_color=[*colour, 1.0])

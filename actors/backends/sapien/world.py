@@ -1,0 +1,207 @@
+"""The physical world of one scene: the robot and the boxes in PhysX, without any graphics."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+import sapien
+from numpy.typing import NDArray
+from sapien import physx
+from sapien.wrapper.urdf_loader import URDFLoader
+
+from actors.simulator import ROBOT, Box, Pose, Scene
+from sim_assets.hand import PHALANGES
+from sim_assets.icub import ARM_JOINTS, NECK_JOINTS, Capsule, Collider, Cuboid, IcubModel
+
+Floats = NDArray[np.float64]
+
+ROBOT_FRICTION: Final = 1.0
+"""Friction of the robot's skin. PhysX takes the mean of the two materials that touch."""
+POSITION_ITERATIONS: Final = 12
+VELOCITY_ITERATIONS: Final = 1
+CONTACT_OFFSET_M: Final = 0.004
+
+_FINGER_LINKS: Final = frozenset(p.joint.removesuffix("_joint") for p in PHALANGES)
+# Collision groups: whatever shares a bit of the third group does not touch. So the robot never
+# touches itself, and boxes touch everything.
+_ROBOT_GROUPS: Final = [1, 1, 1, 0]
+
+
+class RobotBuilder:
+    """Builds the articulation again and again, reading the URDF once."""
+
+    def __init__(self, model: IcubModel) -> None:
+        loader = URDFLoader()
+        loader.set_scene(sapien.Scene([physx.PhysxCpuSystem()]))
+        self._builder = loader.load_file_as_articulation_builder(str(model.urdf))
+        self._joints = model.joints
+        material = physx.PhysxMaterial(ROBOT_FRICTION, ROBOT_FRICTION, 0.0)
+        links = {link.name: link for link in self._builder.link_builders}
+        for collider in model.colliders:
+            links[collider.link].collision_groups = _ROBOT_GROUPS
+            _add_collider(links[collider.link], collider, material)
+
+    def build(self, scene: sapien.Scene, height_m: float) -> Any:
+        """Put the robot into a scene, its root link `height_m` above the origin."""
+        self._builder.set_scene(scene)
+        self._builder.set_initial_pose(_root_pose(height_m))
+        robot = self._builder.build(fix_root_link=True)
+        for link in robot.links:
+            link.disable_gravity = True  # as if the arm's controller compensated for it
+        for name in self._joints:
+            _tune(robot.find_joint_by_name(name))
+        return robot
+
+
+def _add_collider(link: Any, collider: Collider, material: Any) -> None:
+    match collider:
+        case Cuboid(_, centre_m, size_m):
+            link.add_box_collision(sapien.Pose(centre_m), np.array(size_m) / 2, material)
+        case Capsule(_, start_m, end_m, radius_m) if start_m == end_m:
+            link.add_sphere_collision(sapien.Pose(start_m), radius_m, material)
+        case Capsule(_, start_m, end_m, radius_m):
+            pose, length_m = along(np.array(start_m), np.array(end_m))
+            link.add_capsule_collision(pose, radius_m, length_m / 2, material)
+
+
+def along(start: Floats, end: Floats) -> tuple[sapien.Pose, float]:
+    """Pose in the middle of a segment, x along it, and its length."""
+    axis = end - start
+    length = float(np.linalg.norm(axis))
+    x = axis / length
+    helper = np.eye(3)[np.argmin(np.abs(x))]
+    y = np.cross(helper, x)
+    y /= np.linalg.norm(y)
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
+    matrix[:3, 3] = (start + end) / 2
+    return sapien.Pose(matrix), length
+
+
+def _root_pose(height_m: float) -> sapien.Pose:
+    """Root frame (x back, y right, z up) in the world frame (x right, y forward, z up)."""
+    half = np.sqrt(0.5)
+    return sapien.Pose([0.0, 0.0, height_m], [half, 0.0, 0.0, -half])
+
+
+def _tune(joint: Any) -> None:
+    """Set a joint's drive: stiffness, damping and the greatest torque (Nm)."""
+    if joint.name in ARM_JOINTS:
+        joint.set_drive_properties(400.0, 40.0, 60.0)
+        joint.set_armature(np.full((1, 1), 0.02))
+    elif joint.name in NECK_JOINTS:
+        joint.set_drive_properties(100.0, 10.0, 20.0)
+    else:
+        joint.set_drive_properties(3.0, 0.08, 0.6)
+        joint.set_armature(np.full((1, 1), 1e-5))
+
+
+class World:
+    """The robot and the boxes of one scene.
+
+    Made anew for each scene: nothing that PhysX remembers from an earlier one can change it.
+    """
+
+    def __init__(
+        self,
+        builder: RobotBuilder,
+        joints: tuple[str, ...],
+        scene: Scene,
+        start_rad: Floats,
+        period_s: float,
+    ) -> None:
+        _configure_physics()
+        self._scene = sapien.Scene([physx.PhysxCpuSystem()])
+        self._system = self._scene.physx_system
+        self._system.timestep = period_s
+        self._robot = builder.build(self._scene, scene.table_drop_m)
+        order = [joint.name for joint in self._robot.active_joints]
+        self._drives = [self._robot.find_joint_by_name(name) for name in joints]
+        self._from_ours = np.array([joints.index(name) for name in order])
+        self._to_ours = np.array([order.index(name) for name in joints])
+        self._links = {link.name: link for link in self._robot.links}
+        self._bodies = {box.name: _add_box(self._scene, box) for box in scene.boxes}
+        moving = {box.name for box in scene.boxes if box.mass_kg is not None}
+        self._watched = {self._bodies[box.name]: box.name for box in scene.boxes if box.watched}
+        self._touchers = dict.fromkeys(self._links.values(), ROBOT)
+        self._touchers |= {self._bodies[name]: name for name in moving}
+        self._moving = {self._bodies[name] for name in moving}
+        self._fingers = {link for name, link in self._links.items() if name in _FINGER_LINKS}
+        self.put(start_rad, {})
+        self.drive(start_rad)
+
+    def drive(self, targets_rad: Floats) -> None:
+        """Give every joint (J,) its target."""
+        for joint, target in zip(self._drives, targets_rad.tolist(), strict=True):
+            joint.set_drive_target(target)
+
+    def step(self) -> None:
+        """Run one physics step."""
+        self._system.step()
+
+    def touches(self) -> Iterator[tuple[str, str]]:
+        """(watched box, toucher) pairs of the physics step that has just run."""
+        for box, other in self._pairs(self._watched, self._touchers):
+            yield self._watched[box], self._touchers[other]
+
+    def finger_contact(self) -> bool:
+        """Whether any finger touched a moving box in the physics step that has just run."""
+        return any(True for _ in self._pairs(self._fingers, self._moving))
+
+    def _pairs(self, ones: Container[Any], others: Container[Any]) -> Iterator[tuple[Any, Any]]:
+        """Touching bodies, the first of `ones`, the second of `others`.
+
+        Bodies touch if they overlap or push each other; PhysX also reports pairs that are near.
+        """
+        for contact in self._system.get_contacts():
+            first, second = contact.bodies
+            for one, other in ((first, second), (second, first)):
+                if one in ones and other in others and _is_touch(contact):
+                    yield one, other
+
+    def joints_rad(self) -> Floats:
+        """Measured joint angles (J,)."""
+        return np.asarray(self._robot.qpos[self._to_ours], dtype=np.float64)
+
+    def put(self, joints_rad: Floats, boxes: Mapping[str, Pose]) -> None:
+        """Place the robot, at rest, and boxes."""
+        self._robot.set_qpos(joints_rad[self._from_ours])
+        self._robot.set_qvel(np.zeros(len(joints_rad)))
+        for name, pose in boxes.items():
+            self._bodies[name].entity.set_pose(sapien.Pose(pose.position_m, pose.quaternion))
+
+    def poses(self) -> dict[str, sapien.Pose]:
+        """Poses of all links and boxes, by name."""
+        parts = self._links | self._bodies
+        return {name: body.entity_pose for name, body in parts.items()}
+
+
+def _configure_physics() -> None:
+    """PhysX keeps these for the whole process."""
+    physx.set_body_config(
+        solver_position_iterations=POSITION_ITERATIONS,
+        solver_velocity_iterations=VELOCITY_ITERATIONS,
+    )
+    physx.set_shape_config(contact_offset=CONTACT_OFFSET_M, rest_offset=0.0)
+    physx.set_scene_config(bounce_threshold=0.2, enable_pcm=True, enable_tgs=True)
+
+
+def _add_box(scene: sapien.Scene, box: Box) -> Any:
+    builder = scene.create_actor_builder()
+    builder.add_box_collision(
+        half_size=np.array(box.size_m) / 2,
+        material=physx.PhysxMaterial(box.friction, box.friction, 0.0),
+        density=0.0 if box.mass_kg is None else box.mass_kg / float(np.prod(box.size_m)),
+    )
+    builder.set_initial_pose(sapien.Pose(box.pose.position_m, box.pose.quaternion))
+    if box.mass_kg is None:
+        entity = builder.build_static(box.name)
+        return entity.find_component_by_type(physx.PhysxRigidStaticComponent)
+    entity = builder.build(box.name)
+    return entity.find_component_by_type(physx.PhysxRigidDynamicComponent)
+
+
+def _is_touch(contact: Any) -> bool:
+    return any(point.separation < 0.0 or point.impulse.any() for point in contact.points)
