@@ -65,12 +65,34 @@ class SimulatorConfig(_Section):
         return self
 
 
-class TutorConfig(_Section):
-    """How the tutor executes its plan when a case is tutored again."""
+class ActorConfig(_Section):
+    """What actors do besides tutoring and trials.
 
+    Attributes:
+        practice: play situations of one's own when nothing is asked for.
+        live: publish each step for whoever watches.
+    """
+
+    practice: bool = True
+    live: bool = True
+
+
+class TutorConfig(_Section):
+    """Which cases are tutored, and how the plan is executed when a case is tutored again.
+
+    Attributes:
+        cases: indices of the task's tutored cases; None for all.
+        repeats: executions of each case, the first of them clean.
+        noise_deg: amplitude of the execution noise.
+        noise_correlation_steps: over how many control steps it is correlated.
+        lease_s: a case that was handed out for so long may be handed out again.
+    """
+
+    cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
     repeats: Count = 4
     noise_deg: NotNegative = 1.0
     noise_correlation_steps: Positive = 20.0
+    lease_s: Positive = 60.0
 
 
 class SubnetConfig(_Section):
@@ -113,8 +135,13 @@ class PretrainingConfig(_Section):
 
 
 class LearnerConfig(_Section):
-    """Coupled training of PFC, M_S and M_F, and when policies are published."""
+    """Coupled training of PFC, M_S and M_F, and when policies are published.
 
+    On the bus, training starts with `start_sequences` sequences (or with all there will be, if they
+    are fewer), while the others still come in.
+    """
+
+    start_sequences: Count = 45
     epochs: Count = 2500
     rate: Positive = 3e-3
     schedule: Literal["constant", "cosine"] = "cosine"
@@ -144,7 +171,12 @@ class RecorderConfig(_Section):
 
 
 class DoneConfig(_Section):
-    """When a run started by deploy/run_local.sh is finished; all conditions must hold."""
+    """When a run started by deploy/run_local.sh is finished; with neither condition, never.
+
+    Attributes:
+        policy_versions: so many policy versions were published.
+        trials: the newest policy version, and it is at least that one, has so many trials counted.
+    """
 
     policy_versions: Count | None = None
     trials: Count | None = None
@@ -157,6 +189,7 @@ class Config(_Section):
     hub: HubConfig = HubConfig()
     task: TaskConfig = TaskConfig()
     simulator: SimulatorConfig = SimulatorConfig()
+    actor: ActorConfig = ActorConfig()
     tutor: TutorConfig = TutorConfig()
     network: NetworkConfig = NetworkConfig()
     learner: LearnerConfig = LearnerConfig()
@@ -169,9 +202,19 @@ class Config(_Section):
         """Folder of the run."""
         return self.run.folder / self.run.name
 
+    @model_validator(mode="after")
+    def _can_be_done(self) -> Self:
+        if (self.done.trials or 0) > self.evaluator.trials_per_policy:
+            raise ValueError("done.trials must not exceed evaluator.trials_per_policy")
+        return self
+
     def digest(self) -> str:
-        """Twelve hexadecimal digits that tell one effective configuration from another."""
-        text = json.dumps(self.model_dump(mode="json"), sort_keys=True)
+        """Twelve hexadecimal digits that tell one effective configuration from another.
+
+        Where the hub and the folder are makes no difference.
+        """
+        values = self.model_dump(mode="json", exclude={"hub": True, "run": {"folder"}})
+        text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def save(self, path: Path) -> None:

@@ -5,12 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
+from proto.codec import Array, Integer, Many, Maybe, Number, Size, Table, Text
+
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
+
+JOINTS: Final = 18
+"""Measured joints: 2 of the neck, 7 of the arm, 9 motors of the hand."""
+LARGEST_DEG: Final = 360.0
+"""No joint angle or level is larger."""
+STEPS: Final = Size("T", 1, 2000)
+BODIES: Final = Size("B", 0, 256)
+Id = Annotated[str, Text(64, r"[A-Za-z0-9][A-Za-z0-9._-]*")]
+"""Names an episode, a process or a run; may stand in a key and in a file name."""
 
 
 class Kind(StrEnum):
@@ -96,26 +109,28 @@ class Episode:
         control_period_s: time from one control step to the next (s).
     """
 
-    id: str
+    id: Id
     kind: Kind
     task: str
-    situation: Mapping[str, float]
-    seed: int
-    actor: str
+    situation: Annotated[Mapping[str, float], Table(Number(), most=32)]
+    seed: Annotated[int, Integer(0, 2**63 - 1)]
+    actor: Id
     backend: str
     policy: str
-    policy_version: int
+    policy_version: Annotated[int, Integer(0, 2**31)]
     config_digest: str
-    images: Image
-    actions: Floats
-    targets: Floats
-    joints_deg: Floats
-    phases: NDArray[np.uint8]
-    body_names: tuple[str, ...]
-    body_poses: Floats
+    images: Annotated[Image, Array("uint8", (STEPS, IMAGE_HEIGHT, IMAGE_WIDTH))]
+    actions: Annotated[Floats, Array("float32", (STEPS, ACTION_SIZE), -LARGEST_DEG, LARGEST_DEG)]
+    targets: Annotated[Floats, Array("float32", (STEPS, ACTION_SIZE), -LARGEST_DEG, LARGEST_DEG)]
+    joints_deg: Annotated[Floats, Array("float32", (STEPS, JOINTS), -LARGEST_DEG, LARGEST_DEG)]
+    phases: Annotated[NDArray[np.uint8], Array("uint8", (STEPS,), 1, 8)]
+    body_names: Annotated[tuple[str, ...], Many(Text(64), BODIES)]
+    body_poses: Annotated[Floats, Array("float32", (STEPS, BODIES, 7), -1e3, 1e3)]
     outcome: Outcome
-    outputs: Floats | None = field(default=None)
-    control_period_s: float = 0.1
+    outputs: Annotated[
+        Floats | None, Maybe(Array("float32", (STEPS, Size("outputs", 1, 4096)), 0.0, 1.001))
+    ] = field(default=None)
+    control_period_s: Annotated[float, Number(1e-6, 1e3)] = 0.1
 
     @property
     def steps(self) -> int:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import logging
+import re
+import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from proto.config import Config, load_config
@@ -21,6 +25,64 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_process(parser: argparse.ArgumentParser) -> None:
+    """Add --config, --set, --connect and --id, for a process on the bus."""
+    add_config(parser)
+    parser.add_argument(
+        "--connect",
+        metavar="tcp/HOST:PORT",
+        help="where the hub listens; without it, the config's hub.endpoint",
+    )
+    parser.add_argument("--id", type=_id, help="what this process is called on the bus")
+
+
 def config_of(arguments: argparse.Namespace) -> Config:
-    """The configuration that the arguments of `add_config` ask for."""
-    return load_config(arguments.config, arguments.overrides)
+    """The configuration that the arguments of `add_config` or `add_process` ask for."""
+    overrides = list(arguments.overrides)
+    if getattr(arguments, "connect", None) is not None:
+        overrides.append(f"hub.endpoint={arguments.connect}")
+    return load_config(arguments.config, overrides)
+
+
+def start_logging(role: str) -> None:
+    """Log lines to standard error, each with time and role."""
+    logging.basicConfig(
+        level=logging.INFO, format=f"%(asctime)s {role} %(levelname)s %(message)s", force=True
+    )
+
+
+def _id(text: str) -> str:
+    if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", text) is None:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not an id: letters, digits, dots, dashes, underscores, at most 64"
+        )
+    return text
+
+
+def add_playing(parser: argparse.ArgumentParser) -> None:
+    """Add what every command that plays episodes without the bus takes, besides `add_config`."""
+    parser.add_argument("--task", help="task to play; without it, task.name of the configuration")
+    parser.add_argument(
+        "--backend", help="simulator; without it, simulator.backend of the configuration"
+    )
+    parser.add_argument(
+        "--workers",
+        type=positive,
+        default=len(os.sched_getaffinity(0)),
+        help="processes to play in",
+    )
+
+
+def playing_config(arguments: argparse.Namespace, overrides: Sequence[str] = ()) -> Config:
+    """The configuration that the arguments of `add_config` and `add_playing` ask for."""
+    asked = {"task.name": arguments.task, "simulator.backend": arguments.backend}
+    named = [f"{key}={value}" for key, value in asked.items() if value is not None]
+    return load_config(arguments.config, [*arguments.overrides, *named, *overrides])
+
+
+def positive(text: str) -> int:
+    """A whole number of at least one, for `type=` of an argument."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{text} is less than 1")
+    return number

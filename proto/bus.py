@@ -1,0 +1,404 @@
+"""The bus: the one place that knows Zenoh.
+
+Two ways to publish. `publish` may lose a message when a reader or a link is slow: for what is
+watched. `deliver` waits for room, but a message that is under way when a connection breaks is gone
+all the same: what must arrive is kept in an `Outbox` until its receipt comes.
+
+A message that is not what it should be is counted, logged once for each sender, and dropped.
+Callbacks run in Zenoh's threads: they return quickly. Zenoh does not survive a fork: start
+processes with spawn or exec, and close every bus, or the process never ends.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import re
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Generic, Self, TypeVar
+
+import zenoh
+import zenoh.ext
+
+from proto.codec import MessageError, Text, Wire, decode, encode, message, schema_of
+from proto.config import HubConfig
+from proto.errors import UserError
+from proto.keys import Keys, Role
+
+LOG = logging.getLogger(__name__)
+
+CONNECT_WAIT_S: Final = 4.0
+"""How long a starting process waits for the hub."""
+SHARED_MEMORY_FROM_BYTES: Final = 64 * 1024
+_SENDERS_REMEMBERED: Final = 1000
+_HEARTBEAT_S: Final = 1.0
+
+M = TypeVar("M")
+Answer = TypeVar("Answer")
+
+
+@message("attachment", 1, form="json")
+@dataclass(frozen=True)
+class Attachment:
+    """What goes with every message of ours; messages of others may lack it.
+
+    Attributes:
+        sender: role and id of who sent it.
+        sha256: digest of the payload.
+    """
+
+    sender: str
+    sha256: Annotated[str, Text(64, "[0-9a-f]{64}")]
+
+    @classmethod
+    def of(cls, payload: bytes, sender: str) -> Self:
+        """The attachment of a payload."""
+        return cls(sender, hashlib.sha256(payload).hexdigest())
+
+    @classmethod
+    def read(cls, content: bytes) -> Self:
+        """Decode an attachment, or raise MessageError."""
+        return decode(Wire(schema_of(cls).encoding, content), cls)
+
+    def written(self) -> bytes:
+        """Encode it."""
+        return encode(self).payload
+
+    def check(self, payload: bytes) -> None:
+        """Raise MessageError if the payload is not the one that was sent."""
+        if hashlib.sha256(payload).hexdigest() != self.sha256:
+            raise MessageError("payload", "differs from its digest in the attachment")
+
+
+class Inbox(Generic[M]):
+    """The newest messages of a key that nobody has taken yet; older ones are dropped when full.
+
+    Attributes:
+        dropped: how many messages were dropped because nobody took them in time.
+    """
+
+    def __init__(self, bus: Bus, classes: tuple[type[M], ...], capacity: int) -> None:
+        self.dropped = 0
+        self._bus = bus
+        self._classes = classes
+        self._capacity = capacity
+        self._waiting: deque[zenoh.Sample] = deque()
+        self._arrived = threading.Condition()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def take(self, timeout_s: float = 0.0) -> M | None:
+        """The oldest valid message, waiting for one if need be; None if none came in time."""
+        while (sample := self._next(timeout_s)) is not None:
+            try:
+                return self._bus.decode(sample, *self._classes)
+            except MessageError:
+                continue
+        return None
+
+    def put(self, sample: zenoh.Sample) -> None:
+        """Keep a sample until it is taken."""
+        with self._arrived:
+            if len(self._waiting) == self._capacity:
+                self._waiting.popleft()
+                self.dropped += 1
+            self._waiting.append(sample)
+            self._arrived.notify()
+
+    def _next(self, timeout_s: float) -> zenoh.Sample | None:
+        with self._arrived:
+            if not self._waiting:
+                self._arrived.wait(timeout_s)
+            return self._waiting.popleft() if self._waiting else None
+
+
+class Bus:
+    """One process's connection to the others.
+
+    Attributes:
+        keys: keys of the run.
+        role: what this process is.
+        id: which one it is.
+        refused: messages dropped so far because they were not valid.
+    """
+
+    def __init__(self, session: zenoh.Session, run: str, role: Role, process: str) -> None:
+        self.keys = Keys(run)
+        self.role = role
+        self.id = process
+        self.refused = 0
+        self._session = session
+        self._declared: list[Any] = []  # Zenoh undeclares what nobody refers to
+        self._newest: dict[str, zenoh.ext.AdvancedPublisher] = {}
+        self._complained_about: set[str] = set()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def peers(self) -> int:
+        """Number of sessions that are connected to this one."""
+        return len(self._session.info.transports())
+
+    def close(self) -> None:
+        """Leave; may be called again."""
+        if not self._session.is_closed():
+            self._session.close()  # type: ignore[no-untyped-call]
+
+    def publish(self, key: str, message: Any) -> None:
+        """Publish a message that may be lost."""
+        self._put(key, encode(message), zenoh.CongestionControl.DROP)
+
+    def deliver(self, key: str, message: Any) -> None:
+        """Publish a message, waiting while the link is full; see the top of this module."""
+        self.deliver_wire(key, encode(message))
+
+    def deliver_wire(self, key: str, wire: Wire) -> None:
+        """The same with a message that is encoded already."""
+        self._put(key, wire, zenoh.CongestionControl.BLOCK)
+
+    def publish_newest(self, key: str, message: Any) -> None:
+        """Publish a message that late joiners get as well, as long as this process lives."""
+        if key not in self._newest:
+            self._newest[key] = zenoh.ext.declare_advanced_publisher(
+                self._session,
+                key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                cache=zenoh.ext.CacheConfig(
+                    max_samples=1,
+                    replies_config=zenoh.ext.RepliesConfig(
+                        congestion_control=zenoh.CongestionControl.BLOCK
+                    ),
+                ),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(
+                    heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None
+                ),
+                publisher_detection=True,
+            )
+        wire = encode(message)
+        self._newest[key].put(
+            wire.payload, encoding=wire.encoding, attachment=self._attachment(wire)
+        )
+
+    def subscribe(self, key: str, callback: Callable[[M], None], *classes: type[M]) -> None:
+        """Call back with every message of `classes` under a key."""
+        self._declared.append(
+            self._session.declare_subscriber(key, self._receiver(callback, classes))
+        )
+
+    def subscribe_newest(self, key: str, callback: Callable[[M], None], *classes: type[M]) -> None:
+        """The same for `publish_newest`: what was published before is received first."""
+        self._declared.append(
+            zenoh.ext.declare_advanced_subscriber(
+                self._session,
+                key,
+                self._receiver(callback, classes),
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+                recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            )
+        )
+
+    def inbox(self, key: str, *classes: type[M], capacity: int) -> Inbox[M]:
+        """Collect the messages of `classes` under a key until they are taken."""
+        inbox = Inbox(self, classes, capacity)
+        self._declared.append(self._session.declare_subscriber(key, inbox.put))
+        return inbox
+
+    def ask(
+        self, key: str, question: Any, answer: type[Answer], *, timeout_s: float = 2.0
+    ) -> list[Answer]:
+        """Ask everyone who answers under a key; nobody, or nobody in time, is an empty list."""
+        wire = encode(question)
+        replies = self._session.get(
+            key,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout_s,
+            payload=wire.payload,
+            encoding=wire.encoding,
+            attachment=self._attachment(wire),
+        )
+        answers = []
+        for reply in replies:
+            if reply.ok is not None:
+                try:
+                    answers.append(self.decode(reply.ok, answer))
+                except MessageError:
+                    continue
+        return answers
+
+    def answer(self, key: str, question: type[M], callback: Callable[[M], object | None]) -> None:
+        """Answer questions under a key with a message, or with None: nothing to say."""
+
+        def on_query(query: zenoh.Query) -> None:
+            with query:  # a query that is not dropped hangs whoever asks
+                try:
+                    message = callback(self.decode(query, question))
+                    if message is not None:
+                        wire = encode(message)
+                        query.reply(
+                            key,
+                            wire.payload,
+                            encoding=wire.encoding,
+                            attachment=self._attachment(wire),
+                        )
+                except MessageError:
+                    pass
+                except Exception:
+                    LOG.exception("a question under %s could not be answered", key)
+
+        self._declared.append(self._session.declare_queryable(key, on_query))
+
+    def announce(self) -> None:
+        """Show that this process lives, until it closes the bus or dies."""
+        token = self._session.liveliness().declare_token(self.keys.alive(self.role, self.id))
+        self._declared.append(token)
+
+    def present(self, role: Role) -> set[str]:
+        """Ids of the processes of a role that live."""
+        replies = self._session.liveliness().get(self.keys.alive(role), timeout=2.0)
+        return {
+            str(reply.ok.key_expr).rpartition("/")[2] for reply in replies if reply.ok is not None
+        }
+
+    def watch_presence(self, role: Role, callback: Callable[[str, bool], None]) -> None:
+        """Call back with an id and True for each process of a role that lives, False when it dies.
+
+        When the hub dies, so does everyone, seen from here.
+        """
+
+        def on_change(sample: zenoh.Sample) -> None:
+            process = str(sample.key_expr).rpartition("/")[2]
+            try:
+                callback(process, sample.kind == zenoh.SampleKind.PUT)
+            except Exception:
+                LOG.exception("presence of %s %s could not be handled", role, process)
+
+        self._declared.append(
+            self._session.liveliness().declare_subscriber(
+                self.keys.alive(role), on_change, history=True
+            )
+        )
+
+    def decode(self, received: zenoh.Sample | zenoh.Query, *classes: type[M]) -> M:
+        """The message in what was received.
+
+        Raises:
+            MessageError: it is not valid; it has been counted and logged.
+        """
+        sender = str(received.key_expr)
+        payload = b"" if received.payload is None else received.payload.to_bytes()
+        try:
+            if received.attachment is not None:
+                attachment = Attachment.read(received.attachment.to_bytes())
+                sender = f"{attachment.sender} ({sender})"
+                attachment.check(payload)
+            return decode(Wire(str(received.encoding), payload), *classes)
+        except MessageError as error:
+            self._refuse(sender, error)
+            raise
+
+    def _put(self, key: str, wire: Wire, congestion: zenoh.CongestionControl) -> None:
+        self._session.put(
+            key,
+            wire.payload,
+            encoding=wire.encoding,
+            attachment=self._attachment(wire),
+            congestion_control=congestion,
+        )
+
+    def _attachment(self, wire: Wire) -> bytes:
+        return Attachment.of(wire.payload, f"{self.role}/{self.id}").written()
+
+    def _receiver(
+        self, callback: Callable[[M], None], classes: tuple[type[M], ...]
+    ) -> Callable[[zenoh.Sample], None]:
+        def on_sample(sample: zenoh.Sample) -> None:
+            try:
+                callback(self.decode(sample, *classes))
+            except MessageError:
+                pass
+            except Exception:
+                LOG.exception("a message under %s could not be handled", sample.key_expr)
+
+        return on_sample
+
+    def _refuse(self, sender: str, error: MessageError) -> None:
+        self.refused += 1
+        if sender in self._complained_about or len(self._complained_about) >= _SENDERS_REMEMBERED:
+            return
+        self._complained_about.add(sender)
+        LOG.warning("refused a message of %s: %s (said once for each sender)", sender, error)
+
+
+def open_bus(config: HubConfig, run: str, role: Role, process: str) -> Bus:
+    """Connect to the hub; once connected, a lost connection comes back by itself.
+
+    Raises:
+        UserError: no hub answers within CONNECT_WAIT_S.
+    """
+    settings = _settings(config, "client")
+    settings["connect"] = {
+        "endpoints": [config.endpoint],
+        "timeout_ms": round(CONNECT_WAIT_S * 1000),
+        "exit_on_failure": True,
+        "retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
+    }
+    settings["listen"] = {"endpoints": []}
+    try:
+        return Bus(_open(settings), run, role, process)
+    except zenoh.ZError as error:
+        raise UserError(
+            f"no hub answers at {config.endpoint}: start one with `vmdnn hub`, or name the right "
+            f"one with --connect tcp/HOST:PORT ({_reason(error)})"
+        ) from error
+
+
+def open_hub(config: HubConfig, run: str, process: str) -> Bus:
+    """Open the hub itself: a Zenoh router inside this process that listens at the endpoint.
+
+    Raises:
+        UserError: it cannot listen there.
+    """
+    settings = _settings(config, "router")
+    settings["listen"] = {"endpoints": [config.endpoint], "exit_on_failure": True}
+    try:
+        return Bus(_open(settings), run, Role.HUB, process)
+    except zenoh.ZError as error:
+        raise UserError(
+            f"the hub cannot listen at {config.endpoint}: {_reason(error)}. Is another hub "
+            "running there? Stop it, or choose another port with --set hub.endpoint=tcp/HOST:PORT"
+        ) from error
+
+
+def _settings(config: HubConfig, mode: str) -> dict[str, Any]:
+    return {
+        "mode": mode,
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "timestamping": {"enabled": True},  # the newest sample of a key is kept by its timestamp
+        "transport": {
+            "shared_memory": {
+                "enabled": config.shared_memory,
+                "transport_optimization": {"message_size_threshold": SHARED_MEMORY_FROM_BYTES},
+            }
+        },
+    }
+
+
+def _open(settings: dict[str, Any]) -> zenoh.Session:
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """The first cause in a Zenoh error, without the places in Zenoh's source."""
+    text = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
+    causes = re.findall(r"\[\S+: ([^\[\]]+)\]", text)
+    return str(causes[-1] if causes else text)

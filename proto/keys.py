@@ -1,0 +1,75 @@
+"""The keys of a run: every name under which something crosses a process boundary."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Role(StrEnum):
+    """What a process is."""
+
+    HUB = "hub"
+    ACTOR = "actor"
+    LEARNER = "learner"
+    EVALUATOR = "evaluator"
+    RECORDER = "recorder"
+    WATCH = "watch"
+
+
+ANYONE = "*"
+"""Stands for every id when subscribing."""
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Keys of one run.
+
+    Attributes:
+        run: name of the run.
+    """
+
+    run: str
+
+    @property
+    def policy(self) -> str:
+        """Learner to all: `PolicyVersion`."""
+        return f"vmdnn/{self.run}/policy"
+
+    @property
+    def request_tutoring(self) -> str:
+        """Actor asks the learner: `TutoringRequest`, answered by `TutoringCase` or nothing."""
+        return f"vmdnn/{self.run}/request/tutoring"
+
+    @property
+    def request_trial(self) -> str:
+        """Actor asks the evaluator: `TrialRequest`, answered by `Trial` or nothing."""
+        return f"vmdnn/{self.run}/request/trial"
+
+    def sequence(self, actor: str = ANYONE) -> str:
+        """Actor to learner: `Sequence`."""
+        return f"vmdnn/{self.run}/sequence/{actor}"
+
+    def rollout(self, actor: str = ANYONE) -> str:
+        """Actor to evaluator: `Rollout`."""
+        return f"vmdnn/{self.run}/rollout/{actor}"
+
+    def receipt(self, actor: str) -> str:
+        """Learner and evaluator to actor: `Receipt`."""
+        return f"vmdnn/{self.run}/receipt/{actor}"
+
+    def live(self, actor: str = ANYONE) -> str:
+        """Actor to anyone: `Live`."""
+        return f"vmdnn/{self.run}/live/{actor}"
+
+    def metrics(self, role: Role | str = ANYONE, process: str = ANYONE) -> str:
+        """Every process to anyone: its metrics, see `proto.metrics`."""
+        return f"vmdnn/{self.run}/metrics/{role}/{process}"
+
+    def alive(self, role: Role | str = ANYONE, process: str = ANYONE) -> str:
+        """Liveliness token of every process."""
+        return f"vmdnn/{self.run}/alive/{role}/{process}"
+
+    def control(self, role: Role | str) -> str:
+        """Anyone asks all processes of a role: `Control`, answered by `ControlReply`."""
+        return f"vmdnn/{self.run}/control/{role}"

@@ -1,0 +1,54 @@
+"""Work that is handed out, and handed out again when whoever took it is gone."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+Item = TypeVar("Item", bound=Hashable)
+
+
+@dataclass(frozen=True)
+class _Lease:
+    holder: str
+    until_s: float
+
+
+class Leases(Generic[Item]):
+    """Who works on what, until when; used by several threads."""
+
+    def __init__(self, lease_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._lease_s = lease_s
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._leases: dict[Item, _Lease] = {}
+
+    def __len__(self) -> int:
+        with self._lock:
+            self._drop(lambda lease: lease.until_s <= self._clock())
+            return len(self._leases)
+
+    def take(self, holder: str, wanted: Iterable[Item]) -> Item | None:
+        """Give `holder` the first of the wanted items that nobody works on."""
+        with self._lock:
+            self._drop(lambda lease: lease.until_s <= self._clock())
+            item = next((item for item in wanted if item not in self._leases), None)
+            if item is not None:
+                self._leases[item] = _Lease(holder, self._clock() + self._lease_s)
+            return item
+
+    def finish(self, item: Item) -> None:
+        """The item is done."""
+        with self._lock:
+            self._leases.pop(item, None)
+
+    def release(self, holder: str) -> None:
+        """The holder is gone: what it took may be taken again."""
+        with self._lock:
+            self._drop(lambda lease: lease.holder == holder)
+
+    def _drop(self, over: Callable[[_Lease], bool]) -> None:
+        self._leases = {item: lease for item, lease in self._leases.items() if not over(lease)}

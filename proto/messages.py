@@ -1,0 +1,189 @@
+"""What the processes say to each other. Fields are checked as their annotations say."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Annotated, Final
+
+from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
+from proto.codec import MEBIBYTE, Array, Blob, Integer, Maybe, Number, Text, message
+from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind
+from proto.keys import Role
+
+EPISODE_LIMIT: Final = 32 * MEBIBYTE
+POLICY_LIMIT: Final = 256 * MEBIBYTE
+
+Count = Annotated[int, Integer(0, 2**31)]
+
+
+@message("policy", 1, limit=POLICY_LIMIT + MEBIBYTE)
+@dataclass(frozen=True)
+class PolicyVersion:
+    """A trained network, for everyone who acts or tests.
+
+    Attributes:
+        run_id: id of the training; a new one begins when a run is started from nothing.
+        version: 1, 2, ... within a training; it never goes back.
+        epoch: epoch of the coupled training after which it was published.
+        loss: training loss at that epoch.
+        config_digest: digest of the learner's configuration.
+        weights: safetensors file with the network and its metadata.
+    """
+
+    run_id: Id
+    version: Annotated[int, Integer(1, 2**31)]
+    epoch: Count
+    loss: Annotated[float, Number(0.0, 1e9)]
+    config_digest: str
+    weights: Annotated[bytes, Blob(POLICY_LIMIT)]
+
+
+@message("sequence", 1, limit=EPISODE_LIMIT)
+@dataclass(frozen=True)
+class Sequence:
+    """A tutored episode, for the learner."""
+
+    episode: Episode
+
+
+@message("rollout", 1, limit=EPISODE_LIMIT)
+@dataclass(frozen=True)
+class Rollout:
+    """An episode that a network played, for the evaluator.
+
+    Attributes:
+        episode: the whole of it.
+        run_id: training that the policy comes from.
+        trial: index of the trial that was asked for, or None for practice.
+    """
+
+    episode: Episode
+    run_id: Id
+    trial: Annotated[int | None, Maybe(Integer(0, 2**31))]
+
+
+@message("receipt", 1)
+@dataclass(frozen=True)
+class Receipt:
+    """The episode `episode` has arrived and is kept: it need not be sent again."""
+
+    episode: Id
+
+
+@message("tutoring_request", 1)
+@dataclass(frozen=True)
+class TutoringRequest:
+    """An actor asks for a case to demonstrate."""
+
+    actor: Id
+
+
+@message("tutoring_case", 1)
+@dataclass(frozen=True)
+class TutoringCase:
+    """A case to demonstrate.
+
+    Attributes:
+        case: index into the task's tutored situations.
+        repeat: 0 for the clean plan, 1, 2, ... for executions with noise.
+    """
+
+    case: Count
+    repeat: Count
+
+    @property
+    def seed(self) -> int:
+        """Seed of the episode."""
+        return self.case * 1000 + self.repeat
+
+
+@message("trial_request", 1)
+@dataclass(frozen=True)
+class TrialRequest:
+    """An actor asks for a trial of the policy that it holds."""
+
+    actor: Id
+    run_id: Id
+    policy_version: Count
+
+
+@message("trial", 1)
+@dataclass(frozen=True)
+class Trial:
+    """A trial to play with the policy version of the request.
+
+    Attributes:
+        index: which trial of this policy version it is.
+        seed: seed of the situation and of the episode.
+    """
+
+    index: Count
+    seed: Annotated[int, Integer(0, 2**63 - 1)]
+
+
+@message("live", 1)
+@dataclass(frozen=True)
+class Live:
+    """One control step as it happens.
+
+    Attributes:
+        actor: who plays.
+        kind: why.
+        policy: name of the policy.
+        policy_version: its version.
+        step: control step, from 0.
+        phase: subtask of the paper, 1..8.
+        image: (48, 64) uint8, the network's grey picture.
+        joints_deg: (18,) float32, neck, arm and hand as measured.
+        action: (11,) float32, what the robot is told.
+    """
+
+    actor: Id
+    kind: Kind
+    policy: str
+    policy_version: Count
+    step: Count
+    phase: Annotated[int, Integer(1, 8)]
+    image: Annotated[Image, Array("uint8", (IMAGE_HEIGHT, IMAGE_WIDTH))]
+    joints_deg: Annotated[Floats, Array("float32", (JOINTS,), -LARGEST_DEG, LARGEST_DEG)]
+    action: Annotated[Floats, Array("float32", (ACTION_SIZE,), -LARGEST_DEG, LARGEST_DEG)]
+
+
+class Command(StrEnum):
+    """What a process can be told.
+
+    pause: stop playing, training or handing out; keep receiving and answering.
+    resume: end the pause.
+    checkpoint: write to disk what a restart would need.
+    stop: end cleanly.
+    """
+
+    PAUSE = "pause"
+    RESUME = "resume"
+    CHECKPOINT = "checkpoint"
+    STOP = "stop"
+
+
+@message("control", 1, form="json")
+@dataclass(frozen=True)
+class Control:
+    """Tells all processes of a role what to do."""
+
+    command: Command
+
+
+@message("control_reply", 1, form="json")
+@dataclass(frozen=True)
+class ControlReply:
+    """What one process says to a `Control`.
+
+    Attributes:
+        role: what it is.
+        id: which one it is.
+        note: what it did.
+    """
+
+    role: Role
+    id: Id
+    note: Annotated[str, Text(1000)]
