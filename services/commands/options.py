@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import logging
-import re
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
