@@ -78,21 +78,17 @@ class ActorConfig(_Section):
 
 
 class TutorConfig(_Section):
-    """Which cases are tutored, and how the plan is executed when a case is tutored again.
+    """How the tutor executes its plan when a case is tutored again.
 
     Attributes:
-        cases: indices of the task's tutored cases; None for all.
         repeats: executions of each case, the first of them clean.
         noise_deg: amplitude of the execution noise.
         noise_correlation_steps: over how many control steps it is correlated.
-        lease_s: a case that was handed out for so long may be handed out again.
     """
 
-    cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
     repeats: Count = 4
     noise_deg: NotNegative = 1.0
     noise_correlation_steps: Positive = 20.0
-    lease_s: Positive = 60.0
 
 
 class SubnetConfig(_Section):
@@ -137,10 +133,13 @@ class PretrainingConfig(_Section):
 class LearnerConfig(_Section):
     """Coupled training of PFC, M_S and M_F, and when policies are published.
 
-    On the bus, training starts with `start_sequences` sequences (or with all there will be, if they
-    are fewer), while the others still come in.
+    On the bus the learner asks the actors for its sequences: each of `cases` (indices of the task's
+    tutored cases, None for all) `tutor.repeats` times; a case handed out for `lease_s` is handed
+    out again. Training starts with `start_sequences` of them, or with all if they are fewer.
     """
 
+    cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    lease_s: Positive = 60.0
     start_sequences: Count = 45
     epochs: Count = 2500
     rate: Positive = 3e-3

@@ -10,14 +10,13 @@ from typing import Annotated, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
+from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
 from proto.codec import Array, Integer, Many, Maybe, Number, Size, Table, Text
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
-JOINTS: Final = 18
-"""Measured joints: 2 of the neck, 7 of the arm, 9 motors of the hand."""
+JOINTS: Final = len(JOINT_NAMES)
 LARGEST_DEG: Final = 360.0
 """No joint angle or level is larger."""
 STEPS: Final = Size("T", 1, 2000)
