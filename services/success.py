@@ -48,13 +48,6 @@ class Rate:
         """For `json.dumps`."""
         return {"successes": self.successes, "rate": self.rate, "wilson95": list(self.wilson95)}
 
-    def __str__(self) -> str:
-        low, high = self.wilson95
-        return (
-            f"{self.successes} of {self.trials}  {100 * self.rate:.1f} % "
-            f"({100 * low:.1f} to {100 * high:.1f})"
-        )
-
 
 @dataclass
 class Tally:

@@ -1,0 +1,29 @@
+"""`vmdnn replay`: make a video of a recorded episode."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from proto.config import SimulatorConfig
+from proto.recording import read_episode
+from services.progress import progress_bar
+from services.replay import write_video
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the subcommand's arguments."""
+    parser.add_argument("file", type=Path, help="recorded episode, whole or recovered")
+    parser.add_argument("--out", type=Path, required=True, help="MP4 file to write")
+    parser.add_argument("--fps", type=float, help="steps per second; without it, as fast as it was")
+    parser.add_argument("--backend", help="simulator that renders; without it, the recorded one")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Render the episode."""
+    episode = read_episode(arguments.file, partial=True)
+    config = SimulatorConfig(backend=arguments.backend or episode.backend)
+    with progress_bar("rendering", episode.steps) as advance:
+        write_video(episode, arguments.out, config, fps=arguments.fps, on_frame=advance)
+    print(f"{arguments.out}: {episode.steps} frames")
+    return 0

@@ -1,0 +1,46 @@
+"""`vmdnn tutor`: record tutored sequences, without the bus."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import closing
+from pathlib import Path
+
+from rich.console import Console
+
+from actors.tasks.registry import make_task
+from services.commands.options import add_config, add_playing, playing_config, positive
+from services.progress import progress_bar
+from services.success import Tally
+from services.tables import success_table
+from services.tutoring import parse_cases, record, tutoring_jobs
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the subcommand's arguments."""
+    add_config(parser)
+    add_playing(parser)
+    parser.add_argument("--cases", default="all", help="all, or numbers such as 0,3,7-9")
+    parser.add_argument(
+        "--repeats",
+        type=positive,
+        help="how often each case is executed: once clean, then with noise; "
+        "without it, tutor.repeats of the configuration",
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the recordings")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Record what the folder lacks, and show how well the tutor did."""
+    repeats = [] if arguments.repeats is None else [f"tutor.repeats={arguments.repeats}"]
+    config = playing_config(arguments, repeats)
+    cases = parse_cases(arguments.cases, len(make_task(config.task).tutored()))
+    jobs = tutoring_jobs(config, cases, arguments.out)
+    episodes = record(config, jobs, arguments.out, workers=arguments.workers)
+    tally = Tally()
+    with progress_bar("tutoring", len(jobs)) as advance, closing(episodes):
+        for episode in episodes:
+            tally.add(episode.outcome)
+            advance()
+    Console().print(success_table(f"{tally.trials} sequences in {arguments.out}", tally))
+    return 0
