@@ -69,7 +69,7 @@ pip_install() {
 
 # Two of the packages expect shared libraries that a bare system lacks: pin OpenMP, sapien X11.
 setup_libraries() {
-    imports && return
+    imports 2>/dev/null && return
     local libraries=(libgomp1 libx11-6)
     can_install || fail "shared libraries are missing; as root: $(apt_line "${libraries[@]}")"
     apt_install "${libraries[@]}"

@@ -1,0 +1,1 @@
+"""What starts the system: set-up, supervision, configs. Nothing else imports this package."""
