@@ -128,6 +128,13 @@ class PretrainingConfig(_Section):
     epochs: Annotated[int, Field(ge=0)] = 300
     rate: Positive = 2e-3
     batch: Count = 15
+    # values of the situation that are asked for, and in how many classes
+    labels: Annotated[dict[str, Annotated[int, Field(ge=2)]], Field(min_length=1)] = {
+        "object_y_m": 3,
+        "object_yaw_deg": 5,
+    }
+    # last part of a sequence in which the answer is asked for
+    answer_part: Annotated[float, Field(gt=0, le=1)] = 0.25
 
 
 class LearnerConfig(_Section):

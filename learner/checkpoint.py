@@ -1,0 +1,216 @@
+"""Networks and training states in files and messages: safetensors with checked metadata.
+
+A *policy* is a network and what it takes to act with it. A *training checkpoint* is a policy file
+with more in it: optimizer, random state and place in the training. Either can act.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+from safetensors import SafetensorError
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
+
+from learner.softmax_code import SoftmaxCode
+from learner.subnets import parameter_shapes
+from proto.action import ACTION_SIZE
+from proto.config import NetworkConfig
+from proto.errors import UserError
+from proto.files import written_whole
+from proto.metrics import Stage
+
+Tensors = Mapping[str, NDArray[np.generic]]
+
+_METADATA_KEY: Final = "vmdnn"
+NETWORK_PREFIX: Final = "network."
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CodeRanges(_Model):
+    """Ranges of the action values that the outputs code, fixed when coupled training starts."""
+
+    minima: tuple[float, ...]
+    maxima: tuple[float, ...]
+
+
+class TrainingMetadata(_Model):
+    """What only a training checkpoint has beside its tensors.
+
+    Attributes:
+        sequences: ids of the tutored sequences, in the order in which they were taken.
+        classes: centres of the classes of pre-training, by name of the situation's value.
+    """
+
+    sequences: tuple[str, ...]
+    classes: dict[str, tuple[float, ...]]
+
+
+class CheckpointMetadata(_Model):
+    """What a checkpoint says about itself.
+
+    Attributes:
+        format: version of this format.
+        run: name of the run.
+        version: policy version; 0 before the first policy.
+        stage: stage of the training.
+        epoch: epochs of that stage that are done.
+        loss: loss of the last of them, or None.
+        config_digest: digest of the effective configuration.
+        network: the network.
+        code: ranges of the outputs; None as long as the network cannot act.
+        training: None in a policy.
+    """
+
+    format: Literal[1] = 1
+    run: str
+    version: int
+    stage: Stage
+    epoch: int
+    loss: float | None
+    config_digest: str
+    network: NetworkConfig
+    code: CodeRanges | None
+    training: TrainingMetadata | None = None
+
+    def softmax_code(self) -> SoftmaxCode | None:
+        """The code of the outputs, or None as long as the network cannot act."""
+        if self.code is None:
+            return None
+        minima, maxima = np.array(self.code.minima), np.array(self.code.maxima)
+        return SoftmaxCode.of_ranges(minima, maxima, self.network)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A policy or a training state.
+
+    Attributes:
+        metadata: what it is.
+        tensors: arrays by name; the network's begin with `network.`.
+    """
+
+    metadata: CheckpointMetadata
+    tensors: Tensors
+
+    def part(self, prefix: str) -> dict[str, NDArray[np.generic]]:
+        """The tensors whose names begin with prefix, named without it."""
+        return {
+            name.removeprefix(prefix): tensor
+            for name, tensor in self.tensors.items()
+            if name.startswith(prefix)
+        }
+
+
+def checkpoint_bytes(checkpoint: Checkpoint) -> bytes:
+    """The checkpoint as the bytes of a safetensors file."""
+    tensors = {name: np.ascontiguousarray(tensor) for name, tensor in checkpoint.tensors.items()}
+    return save_tensors(tensors, {_METADATA_KEY: checkpoint.metadata.model_dump_json()})
+
+
+def checkpoint_from_bytes(blob: bytes, origin: str) -> Checkpoint:
+    """Read and check the bytes of a safetensors file.
+
+    Args:
+        blob: the bytes.
+        origin: where they came from, for messages.
+
+    Raises:
+        UserError: they are damaged, foreign, or their tensors do not fit their own metadata.
+    """
+    try:
+        tensors = load_tensors(blob)
+        header_size = int.from_bytes(blob[:8], "little")
+        text = json.loads(blob[8 : 8 + header_size])["__metadata__"][_METADATA_KEY]
+    except SafetensorError as error:
+        raise UserError(
+            f"{origin} is not a checkpoint, or is damaged ({error}); take another one"
+        ) from error
+    except KeyError as error:
+        raise UserError(
+            f"{origin} is a safetensors file, but not of vmdnn: it lacks the metadata"
+            f" {_METADATA_KEY!r}"
+        ) from error
+    try:
+        metadata = CheckpointMetadata.model_validate_json(text)
+    except ValidationError as error:
+        raise UserError(
+            f"{origin} was written by another version of vmdnn, or is damaged: {error}"
+        ) from error
+    checkpoint = Checkpoint(metadata, tensors)
+    _check_tensors(checkpoint, origin)
+    return checkpoint
+
+
+def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
+    """Write a checkpoint; the file appears under its name only once it is whole.
+
+    Raises:
+        UserError: the file cannot be written there.
+    """
+    with written_whole(path) as stream:
+        stream.write(checkpoint_bytes(checkpoint))
+
+
+def load_checkpoint(path: Path) -> Checkpoint:
+    """Read a checkpoint.
+
+    Raises:
+        UserError: the file is missing, damaged or foreign.
+    """
+    try:
+        blob = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"checkpoint {path} cannot be read: {error.strerror}") from error
+    return checkpoint_from_bytes(blob, f"checkpoint {path}")
+
+
+def check_same_network(wanted: NetworkConfig, checkpoint: Checkpoint, origin: str) -> None:
+    """Refuse a checkpoint of another network.
+
+    Raises:
+        UserError: the networks differ; the message names each field and both values.
+    """
+    here, there = wanted.model_dump(), checkpoint.metadata.network.model_dump()
+    differences = [
+        f"  network.{name}: {there[name]} in the checkpoint, {here[name]} in the config"
+        for name in here
+        if here[name] != there[name]
+    ]
+    if differences:
+        raise UserError(
+            f"{origin} is of another network:\n"
+            + "\n".join(differences)
+            + "\nUse the config that it was trained with, or start a run of another name."
+        )
+
+
+def _check_tensors(checkpoint: Checkpoint, origin: str) -> None:
+    network = checkpoint.part(NETWORK_PREFIX)
+    shapes = {name: tensor.shape for name, tensor in network.items()}
+    wanted = parameter_shapes(checkpoint.metadata.network)
+    if shapes != wanted:
+        wrong = sorted(
+            name for name in shapes.keys() | wanted.keys() if shapes.get(name) != wanted.get(name)
+        )
+        name = wrong[0]
+        raise UserError(
+            f"{origin} does not hold the network that its metadata describes: {name} has shape"
+            f" {shapes.get(name)}, not {wanted.get(name)}"
+        )
+    for name, tensor in network.items():
+        if tensor.dtype != np.float32 or not np.isfinite(tensor).all():
+            raise UserError(f"{origin}: {name} is not all finite float32 numbers")
+    code = checkpoint.metadata.code
+    if code is not None and not len(code.minima) == len(code.maxima) == ACTION_SIZE:
+        raise UserError(f"{origin}: its code is not for {ACTION_SIZE} action values")

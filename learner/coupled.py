@@ -1,0 +1,109 @@
+"""Coupled training of PFC, M_S, M_F and M_O on tutored sequences (paper, section 3.3).
+
+The pre-trained vision does not change any more and gets nothing from above, so what it makes of a
+sequence is computed once, when the sequence comes in.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from learner.loss import kl_divergence
+from learner.softmax_code import SoftmaxCode
+from learner.vision_input import vision_input
+from learner.vmdnn import VMDNN
+from proto.action import ACTION_NAMES
+from proto.episode import Episode, Floats
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Stacked:
+    """All sequences, filled up to the longest.
+
+    Attributes:
+        seen: (S, T, V_S units) activity of V_S.
+        codes: (S, T, 11, softmax units) the teacher's outputs.
+        mask: (S, T) one where a sequence has a step.
+    """
+
+    seen: Tensor
+    codes: Tensor
+    mask: Tensor
+
+
+class CoupledTraining:
+    """Sequences and loss of coupled training.
+
+    Attributes:
+        code: how the outputs code actions; fixed, so that all policies of a run agree.
+        parameters: what is trained: everything but the vision.
+    """
+
+    def __init__(self, network: VMDNN, code: SoftmaxCode) -> None:
+        self.code = code
+        self.parameters = network.coupled_parameters()
+        self._network = network
+        self._seen: list[Tensor] = []
+        self._codes: list[Tensor] = []
+        self._targets: list[Floats] = []
+        self._stack: _Stacked | None = None
+
+    def __len__(self) -> int:
+        return len(self._seen)
+
+    def add(self, episode: Episode) -> None:
+        """Take a sequence in; targets outside the code's ranges are learned as their ends."""
+        self._warn_outside(episode)
+        images = torch.from_numpy(vision_input(episode.images))
+        with torch.no_grad():
+            self._seen.append(self._network.see(images[None])[0])
+        self._codes.append(torch.from_numpy(self.code.encode(episode.targets)))
+        self._targets.append(episode.targets)
+        self._stack = None
+
+    def loss(self, chosen: Tensor) -> Tensor:
+        """Mean divergence of eq. (5), for the sequences with these indices."""
+        stack = self._stacked()
+        log_outputs = self._network.act(stack.seen[chosen])
+        return kl_divergence(log_outputs, stack.codes[chosen], stack.mask[chosen])
+
+    def mean_errors(self) -> NDArray[np.float64]:
+        """(11,) mean distance of the decoded outputs from the targets, over all sequences."""
+        errors = []
+        with torch.no_grad():
+            for seen, targets in zip(self._seen, self._targets, strict=True):
+                outputs = self._network.act(seen[None])[0].exp().numpy()
+                errors.append(np.abs(self.code.decode(outputs) - targets))
+        return np.asarray(np.concatenate(errors).mean(0))
+
+    def _stacked(self) -> _Stacked:
+        if self._stack is None:
+            masks = [torch.ones(len(seen)) for seen in self._seen]
+            self._stack = _Stacked(
+                pad_sequence(self._seen, batch_first=True),
+                pad_sequence(self._codes, batch_first=True),
+                pad_sequence(masks, batch_first=True),
+            )
+        return self._stack
+
+    def _warn_outside(self, episode: Episode) -> None:
+        excess = np.maximum(self.code.minima - episode.targets, episode.targets - self.code.maxima)
+        worst = excess.max(0)
+        for name, amount in zip(ACTION_NAMES, worst, strict=True):
+            if amount > 1e-3:
+                _log.warning(
+                    "sequence %s: %s goes %.2f beyond the range that was fixed when coupled"
+                    " training began; it is learned as the end of that range",
+                    episode.id,
+                    name,
+                    amount,
+                )

@@ -1,0 +1,17 @@
+"""V_I: the grey picture as the network sees it."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from proto.episode import Image
+
+_BRIGHTNESS: Final = ((np.arange(256) / 255 - 0.5) * 2).astype(np.float32)
+
+
+def vision_input(images: Image) -> NDArray[np.float32]:
+    """Grey values 0..255 (..., height, width) uint8 as brightness -1..1, float32."""
+    return np.asarray(_BRIGHTNESS[images])
