@@ -1,0 +1,12 @@
+"""Free ports for tests that open real sessions."""
+
+from __future__ import annotations
+
+import socket
+
+
+def free_endpoint() -> str:
+    """A TCP endpoint on this machine at which nothing listens."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

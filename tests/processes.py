@@ -1,0 +1,55 @@
+"""Real processes for tests: started with a time limit, stopped whatever happens."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+PATIENCE_S = 60.0
+
+
+@contextmanager
+def vmdnn(*words: str | Path, log: Path | None = None) -> Iterator[subprocess.Popen[bytes]]:
+    """`vmdnn WORDS` as a process of its own; killed at the end if it still runs."""
+    command = [sys.executable, "-m", "services.cli", *map(str, words)]
+    with (log or Path("/dev/null")).open("ab") as stream:
+        process = subprocess.Popen(command, stdout=stream, stderr=stream)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(PATIENCE_S)
+
+
+def run_vmdnn(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    """`vmdnn WORDS` until it ends."""
+    return subprocess.run(
+        [sys.executable, "-m", "services.cli", *map(str, words)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+
+
+def stop(process: subprocess.Popen[bytes]) -> int:
+    """Ask a process to stop, and return its exit status."""
+    process.terminate()
+    return process.wait(PATIENCE_S)
+
+
+def eventually(reached: Callable[[], bool], what: str, patience_s: float = PATIENCE_S) -> None:
+    """Wait until something holds; fail if it never does."""
+    over_s = time.monotonic() + patience_s
+    while not reached():
+        assert time.monotonic() < over_s, f"never happened: {what}"
+        time.sleep(0.05)
+
+
+def all_running(processes: Sequence[subprocess.Popen[bytes]]) -> bool:
+    """Whether none of them has ended."""
+    return all(process.poll() is None for process in processes)

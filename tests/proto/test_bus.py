@@ -1,0 +1,259 @@
+"""The bus between real sessions, through a real hub in a process of its own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from subprocess import Popen
+
+import pytest
+import zenoh
+from ports import free_endpoint
+from processes import eventually, run_vmdnn, stop, vmdnn
+
+from proto.bus import Bus, open_bus, open_hub
+from proto.codec import encode
+from proto.config import HubConfig
+from proto.errors import UserError
+from proto.keys import Keys, Role
+from proto.messages import PolicyVersion, Receipt, TrialRequest, TutoringCase, TutoringRequest
+
+KEYS = Keys("test")
+
+
+class Network:
+    """A hub and sessions at it."""
+
+    def __init__(self, stack: ExitStack, endpoint: str) -> None:
+        self.endpoint = endpoint
+        self._stack = stack
+        self.hub: Popen[bytes]
+        self.start_hub()
+
+    def start_hub(self) -> None:
+        self.hub = self._stack.enter_context(vmdnn("hub", "--connect", self.endpoint))
+
+    def join(self, role: Role, name: str) -> Bus:
+        bus = open_bus(HubConfig(endpoint=self.endpoint), "test", role, name)
+        return self._stack.enter_context(bus)
+
+    def stranger(self) -> zenoh.Session:
+        """A session of someone who knows nothing of vmdnn's messages."""
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", f'["{self.endpoint}"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        return self._stack.enter_context(zenoh.open(config))
+
+
+@contextmanager
+def network() -> Iterator[Network]:
+    with ExitStack() as stack:
+        yield Network(stack, free_endpoint())
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Network]:
+    with network() as made:
+        yield made
+
+
+def policy(version: int) -> PolicyVersion:
+    return PolicyVersion("run", version, 10 * version, 0.5, "digest", bytes(300_000))
+
+
+def matched(bus: Bus, key: str) -> None:
+    """Wait until the bus sees a subscriber of a key."""
+    with_publisher = bus._session.declare_publisher(key)
+    eventually(lambda: with_publisher.matching_status.matching, f"a subscriber of {key}")
+    with_publisher.undeclare()
+
+
+def test_messages_arrive_in_order_whole_and_once(shared: Network) -> None:
+    sender, reader = shared.join(Role.LEARNER, "l"), shared.join(Role.ACTOR, "in-order")
+    inbox = reader.inbox(KEYS.receipt("in-order"), Receipt, capacity=200)
+    matched(sender, KEYS.receipt("in-order"))
+    sent = [Receipt(f"episode-{number}") for number in range(100)]
+    for receipt in sent:
+        sender.deliver(KEYS.receipt("in-order"), receipt)
+    assert [inbox.take(timeout_s=10.0) for _ in sent] == sent
+    assert inbox.take(timeout_s=0.1) is None
+
+
+def test_a_full_inbox_drops_the_oldest_and_says_so(shared: Network) -> None:
+    sender, reader = shared.join(Role.LEARNER, "l2"), shared.join(Role.ACTOR, "full")
+    inbox = reader.inbox(KEYS.receipt("full"), Receipt, capacity=3)
+    matched(sender, KEYS.receipt("full"))
+    for number in range(10):
+        sender.deliver(KEYS.receipt("full"), Receipt(f"episode-{number}"))
+    eventually(lambda: inbox.dropped == 7, "seven dropped")
+    assert inbox.take() == Receipt("episode-7")
+
+
+def test_a_bad_message_is_counted_logged_once_and_harms_nothing(
+    shared: Network, caplog: pytest.LogCaptureFixture
+) -> None:
+    key = KEYS.receipt("guarded")
+    reader, sender = shared.join(Role.ACTOR, "guarded"), shared.join(Role.LEARNER, "honest")
+    stranger = shared.stranger()
+    received: list[Receipt] = []
+    reader.subscribe(key, received.append, Receipt)
+    matched(sender, key)
+    wire = encode(Receipt("fine"))
+    with caplog.at_level(logging.WARNING):
+        stranger.put(key, b"what?")
+        stranger.put(key, wire.payload[:-1], encoding=wire.encoding)
+        stranger.put(key, b"\xc1" * 100, encoding=wire.encoding, attachment=b"{")
+        stranger.put(key, bytes(100_000), encoding=wire.encoding)
+        stranger.delete(key)
+        sender.publish(key, TutoringCase(1, 2))
+        sender.publish(key, TutoringCase(1, 3))
+        eventually(lambda: reader.refused == 7, "seven refused")
+        stranger.put(key, wire.payload, encoding=wire.encoding)
+        sender.deliver(key, Receipt("fine"))
+        eventually(lambda: len(received) == 2, "the good ones arrive")
+    logged = [record.message for record in caplog.records if "refused" in record.message]
+    assert len(logged) == 2
+    assert "encoding: expected application/msgpack;vmdnn.receipt.1" in logged[0]
+    assert "learner/honest" in logged[1]
+
+
+def test_a_payload_that_changed_on_its_way_is_refused(shared: Network) -> None:
+    key = KEYS.receipt("digest")
+    reader, stranger = shared.join(Role.ACTOR, "digest"), shared.stranger()
+    inbox = reader.inbox(key, Receipt, capacity=5)
+    matched(reader, key)
+    genuine = encode(Receipt("genuine"))
+    attachment = b'{"sender": "actor/x", "sha256": "' + b"0" * 64 + b'"}'
+    stranger.put(key, genuine.payload, encoding=genuine.encoding, attachment=attachment)
+    assert inbox.take(timeout_s=0.5) is None
+    assert reader.refused == 1
+
+
+def test_a_callback_that_fails_does_not_end_the_subscription(shared: Network) -> None:
+    sender, reader = shared.join(Role.LEARNER, "l3"), shared.join(Role.ACTOR, "failing")
+    received: list[Receipt] = []
+
+    def fail_at_first(receipt: Receipt) -> None:
+        received.append(receipt)
+        if len(received) == 1:
+            raise RuntimeError("on purpose")
+
+    reader.subscribe(KEYS.receipt("failing"), fail_at_first, Receipt)
+    matched(sender, KEYS.receipt("failing"))
+    for name in ("first", "second"):
+        sender.deliver(KEYS.receipt("failing"), Receipt(name))
+    eventually(lambda: len(received) == 2, "the second message")
+
+
+def test_questions_are_answered_with_a_message_or_with_nothing(shared: Network) -> None:
+    learner, actor = shared.join(Role.LEARNER, "asked"), shared.join(Role.ACTOR, "asking")
+    cases = [TutoringCase(3, 1)]
+
+    def hand_out(request: TutoringRequest) -> TutoringCase | None:
+        if request.actor == "fail":
+            raise RuntimeError("on purpose")
+        return cases.pop() if cases else None
+
+    learner.answer(KEYS.request_tutoring, TutoringRequest, hand_out)
+
+    def ask(name: str) -> list[TutoringCase]:
+        return actor.ask(KEYS.request_tutoring, TutoringRequest(name), TutoringCase)
+
+    eventually(lambda: ask("fail") == [] and ask("asking") == [TutoringCase(3, 1)], "an answer")
+    assert ask("asking") == []
+    assert actor.ask(KEYS.request_tutoring, TrialRequest("a", "b", 1), TutoringCase) == []
+    assert learner.refused == 1
+
+
+def test_nobody_to_ask_is_no_answer_at_once(shared: Network) -> None:
+    actor = shared.join(Role.ACTOR, "lonely")
+    answers: list[list[TutoringCase]] = []
+
+    def ask() -> None:
+        request = TutoringRequest("lonely")
+        answers.append(actor.ask("vmdnn/test/nobody", request, TutoringCase, timeout_s=30.0))
+
+    thread = threading.Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(15.0)
+    assert answers == [[]]
+
+
+def test_the_newest_policy_reaches_late_joiners_only_once() -> None:
+    with network() as net:
+        learner, early = net.join(Role.LEARNER, "learner"), net.join(Role.ACTOR, "early")
+        seen: dict[str, list[int]] = {"early": [], "late": []}
+        early.subscribe_newest(
+            KEYS.policy, lambda new: seen["early"].append(new.version), PolicyVersion
+        )
+        for version in (1, 2, 3):
+            learner.publish_newest(KEYS.policy, policy(version))
+        eventually(lambda: seen["early"] == [1, 2, 3], "every version for who is there")
+        late = net.join(Role.ACTOR, "late")
+        late.subscribe_newest(
+            KEYS.policy, lambda new: seen["late"].append(new.version), PolicyVersion
+        )
+        eventually(lambda: seen["late"] == [3], "the newest for who comes late")
+
+
+def test_everything_comes_back_after_the_hub_was_killed() -> None:
+    with network() as net:
+        learner, actor = net.join(Role.LEARNER, "learner"), net.join(Role.ACTOR, "actor")
+        versions: list[int] = []
+        presence: list[tuple[str, bool]] = []
+        actor.announce()
+        learner.watch_presence(Role.ACTOR, lambda name, alive: presence.append((name, alive)))
+        learner.answer(KEYS.request_tutoring, TutoringRequest, lambda _: TutoringCase(0, 0))
+        actor.subscribe_newest(KEYS.policy, lambda new: versions.append(new.version), PolicyVersion)
+        learner.publish_newest(KEYS.policy, policy(1))
+        eventually(lambda: versions == [1] and presence == [("actor", True)], "the beginning")
+
+        net.hub.kill()
+        eventually(lambda: presence[-1] == ("actor", False), "everyone is gone without a hub")
+        assert actor.ask(KEYS.request_tutoring, TutoringRequest("actor"), TutoringCase) == []
+        learner.publish_newest(KEYS.policy, policy(2))  # into the void
+        net.start_hub()
+        eventually(lambda: presence[-1] == ("actor", True), "the actor is back")
+        eventually(lambda: versions[-1] == 2, "what was published without a hub arrives")
+        eventually(
+            lambda: actor.ask(KEYS.request_tutoring, TutoringRequest("actor"), TutoringCase) != [],
+            "questions are answered again",
+        )
+
+
+def test_presence_ends_with_the_process(shared: Network) -> None:
+    watcher, mortal = shared.join(Role.LEARNER, "watcher"), shared.join(Role.RECORDER, "mortal")
+    seen: list[tuple[str, bool]] = []
+    watcher.watch_presence(Role.RECORDER, lambda name, alive: seen.append((name, alive)))
+    mortal.announce()
+    eventually(lambda: seen == [("mortal", True)], "it is seen")
+    assert watcher.present(Role.RECORDER) == {"mortal"}
+    mortal.close()
+    eventually(lambda: seen[-1] == ("mortal", False), "it is missed")
+    assert watcher.present(Role.RECORDER) == set()
+
+
+def test_without_a_hub_a_process_says_what_to_do() -> None:
+    endpoint = free_endpoint()
+    with pytest.raises(
+        UserError, match=f"no hub answers at {endpoint}: start one with `vmdnn hub`"
+    ):
+        open_bus(HubConfig(endpoint=endpoint), "test", Role.ACTOR, "actor")
+
+
+def test_a_taken_port_says_what_to_do(shared: Network) -> None:
+    with pytest.raises(UserError, match=r"Address already in use.*another port"):
+        open_hub(HubConfig(endpoint=shared.endpoint), "test", "second")
+    ended = run_vmdnn("hub", "--connect", shared.endpoint)
+    assert ended.returncode == 2
+    assert "another hub" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_a_hub_that_is_told_to_stop_ends_cleanly() -> None:
+    with network() as net:
+        net.join(Role.ACTOR, "actor")
+        assert stop(net.hub) == 0
