@@ -21,11 +21,10 @@ from typing import Final
 
 import icub_models
 import numpy as np
-from numpy.typing import NDArray
 
-from sim_assets import hand
-
-Vector = tuple[float, float, float]
+from sim_assets import hand, icub_visuals, urdf
+from sim_assets.icub_visuals import Visual
+from sim_assets.urdf import Vector
 
 SOURCE_MODEL: Final = "iCubGazeboV2_5"
 ROOT: Final = "root_link"
@@ -118,11 +117,15 @@ class IcubModel:
         urdf: kinematics and masses. Root frame: x back, y right, z up.
         colliders: the shapes that touch things; most URDF readers know no capsules.
         joints: names of the joints that move: neck, arm, then phalanges.
+        seen_by_eye: what the left eye sees of its own body, in simple meshes.
+        seen_from_outside: the whole robot in full detail.
     """
 
     urdf: Path
     colliders: tuple[Collider, ...]
     joints: tuple[str, ...]
+    seen_by_eye: tuple[Visual, ...]
+    seen_from_outside: tuple[Visual, ...]
 
 
 def build_icub(cache: Path | None = None) -> IcubModel:
@@ -131,14 +134,19 @@ def build_icub(cache: Path | None = None) -> IcubModel:
     The folder is `cache`, else the environment variable VMDNN_CACHE, else `~/.cache/vmdnn`. Many
     processes may build at once: each builds under a name of its own and renames it when done.
     """
-    source = Path(icub_models.get_model_file(SOURCE_MODEL))
-    folder = _cache_folder(cache) / f"icub-{_digest(source)}"
+    official = Path(icub_models.get_model_file(SOURCE_MODEL))
+    meshes = official.parents[3]  # SHARE/iCub/robots/MODEL/model.urdf; package:// is SHARE
+    source = urdf.Tree(ET.parse(official).getroot())
+    inputs = [official, *icub_visuals.mesh_files(source, meshes)]
+    folder = _cache_folder(cache) / f"icub-{_digest(inputs)}"
     if not folder.is_dir():
-        _build_into(folder, source)
+        _build_into(folder, source, meshes)
     return IcubModel(
         urdf=folder / "icub.urdf",
         colliders=COLLIDERS,
         joints=(*JOINT_LIMITS_DEG, *(phalanx.joint for phalanx in hand.PHALANGES)),
+        seen_by_eye=icub_visuals.read_visuals(folder, "eye"),
+        seen_from_outside=icub_visuals.read_visuals(folder, "outside"),
     )
 
 
@@ -148,22 +156,24 @@ def _cache_folder(cache: Path | None) -> Path:
     return Path(os.environ.get("VMDNN_CACHE") or Path.home() / ".cache" / "vmdnn")
 
 
-def _digest(source: Path) -> str:
-    """Sixteen hexadecimal digits over everything that the build depends on."""
-    inputs = (source, Path(__file__), Path(hand.__file__))
+def _digest(inputs: Iterable[Path]) -> str:
+    """Sixteen hexadecimal digits over everything that the build depends on, this code too."""
+    code = [Path(str(module.__file__)) for module in (hand, icub_visuals, urdf)]
     digest = hashlib.sha256()
-    for path in inputs:
+    for path in (*inputs, *code, Path(__file__)):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def _build_into(folder: Path, source: Path) -> None:
+def _build_into(folder: Path, source: urdf.Tree, meshes: Path) -> None:
     folder.parent.mkdir(parents=True, exist_ok=True)
     unfinished = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=folder.parent))
     try:
-        robot = ET.ElementTree(_robot(ET.parse(source).getroot()))
+        robot = ET.ElementTree(_robot(source))
         ET.indent(robot)
         robot.write(unfinished / "icub.urdf")
+        links = [ROOT, *(urdf.child_of(joint) for joint in _kept_joints(source))]
+        icub_visuals.write_visuals(unfinished, source, meshes, links)
         unfinished.chmod(0o755)
         try:
             unfinished.rename(folder)
@@ -174,149 +184,68 @@ def _build_into(folder: Path, source: Path) -> None:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _robot(source: ET.Element) -> ET.Element:
+def _robot(source: urdf.Tree) -> ET.Element:
     """The pruned and completed URDF."""
-    joint_of = {_child(joint): joint for joint in source.iterfind("joint")}
-    joints = _chain(joint_of, "head") + [
-        joint for joint in _chain(joint_of, HAND) if joint not in _chain(joint_of, "head")
-    ]
-    links = {link.get("name"): link for link in source.iterfind("link")}
     robot = ET.Element("robot", name="icub")
-    robot.append(_official_link(links[ROOT]))
-    for joint in joints:
-        robot.append(_official_link(links[_child(joint)]))
+    robot.append(_official_link(source.links[ROOT]))
+    for joint in _kept_joints(source):
+        robot.append(_official_link(source.links[urdf.child_of(joint)]))
         robot.append(_official_joint(joint))
-    _append_eye(robot, _head_pose(_chain(joint_of, "head")))
+    _append_eye(robot, source.pose("head"))
     for phalanx in hand.PHALANGES:
         _append_phalanx(robot, phalanx)
     return robot
 
 
-def _child(joint: ET.Element) -> str:
-    return _find(joint, "child").get("link", "")
-
-
-def _find(element: ET.Element, tag: str) -> ET.Element:
-    found = element.find(tag)
-    if found is None:
-        raise ValueError(f"{element.tag} {element.get('name')!r} has no <{tag}>")
-    return found
-
-
-def _chain(joint_of: dict[str, ET.Element], link: str) -> list[ET.Element]:
-    """Joints from the root to a link."""
-    joints: list[ET.Element] = []
-    while link in joint_of:
-        joints.insert(0, joint_of[link])
-        link = _find(joints[0], "parent").get("link", "")
-    return joints
+def _kept_joints(source: urdf.Tree) -> list[ET.Element]:
+    to_head = source.chain("head")
+    return to_head + [joint for joint in source.chain(HAND) if joint not in to_head]
 
 
 def _official_link(source: ET.Element) -> ET.Element:
     link = ET.Element("link", name=source.get("name", ""))
     inertial = source.find("inertial")
-    link.append(_inertial(0.001, 1e-7) if inertial is None else inertial)
+    link.append(urdf.inertial(0.001, 1e-7) if inertial is None else inertial)
     return link
 
 
 def _official_joint(source: ET.Element) -> ET.Element:
     name = source.get("name", "")
     joint = ET.Element("joint", name=name, type="revolute" if name in JOINT_LIMITS_DEG else "fixed")
-    joint.extend(_find(source, tag) for tag in ("origin", "parent", "child"))
+    joint.extend(urdf.find(source, tag) for tag in ("origin", "parent", "child"))
     if name in JOINT_LIMITS_DEG:
-        joint.append(_find(source, "axis"))
-        joint.append(_limit(*JOINT_LIMITS_DEG[name]))
+        joint.append(urdf.find(source, "axis"))
+        joint.append(urdf.limit(*JOINT_LIMITS_DEG[name]))
     return joint
 
 
-def _append_eye(robot: ET.Element, head: NDArray[np.float64]) -> None:
+def _append_eye(robot: ET.Element, head: urdf.Matrix) -> None:
     """Fix the eye to the head, whose pose in the root frame at zero is given."""
-    tilt = math.radians(-EYE_TILT_DEG)
-    level = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])  # root x points back
+    level = np.diag([-1.0, -1.0, 1.0])  # the root's x points back
     eye = np.eye(4)
-    eye[:3, :3] = level @ rotation_from_rpy((0.0, tilt, 0.0))
+    eye[:3, :3] = level @ urdf.rotation_from_rpy((0.0, math.radians(-EYE_TILT_DEG), 0.0))
     eye[:3, 3] = EYE_POSITION_M
     in_head = np.linalg.inv(head) @ eye
     link = ET.SubElement(robot, "link", name=EYE)
-    link.append(_inertial(0.001, 1e-7))
+    link.append(urdf.inertial(0.001, 1e-7))
     joint = ET.SubElement(robot, "joint", name=f"{EYE}_joint", type="fixed")
-    joint.append(_origin(in_head[:3, 3], _rpy_from_rotation(in_head[:3, :3])))
+    joint.append(urdf.origin(in_head[:3, 3], urdf.rpy_from_rotation(in_head[:3, :3])))
     ET.SubElement(joint, "parent", link="head")
     ET.SubElement(joint, "child", link=EYE)
-
-
-def _head_pose(chain: Iterable[ET.Element]) -> NDArray[np.float64]:
-    """Product (4, 4) of the joints' origins: the last link in the root frame at zero."""
-    pose = np.eye(4)
-    for joint in chain:
-        origin = _find(joint, "origin")
-        step = np.eye(4)
-        step[:3, :3] = rotation_from_rpy(_numbers(origin.get("rpy", "0 0 0")))
-        step[:3, 3] = _numbers(origin.get("xyz", "0 0 0"))
-        pose = pose @ step
-    return pose
 
 
 def _append_phalanx(robot: ET.Element, phalanx: hand.Phalanx) -> None:
     name = phalanx.joint.removesuffix("_joint")
     link = ET.SubElement(robot, "link", name=name)
-    link.append(_inertial(0.02, 1.5e-6, (phalanx.length_m / 2, 0.0, 0.0)))
+    link.append(urdf.inertial(0.02, 1.5e-6, (phalanx.length_m / 2, 0.0, 0.0)))
     joint = ET.SubElement(robot, "joint", name=phalanx.joint, type="revolute")
-    joint.append(_origin(phalanx.origin_m, (0.0, 0.0, math.radians(phalanx.parent_yaw_deg))))
+    joint.append(urdf.origin(phalanx.origin_m, (0.0, 0.0, math.radians(phalanx.parent_yaw_deg))))
     ET.SubElement(joint, "parent", link=phalanx.parent)
     ET.SubElement(joint, "child", link=name)
-    ET.SubElement(joint, "axis", xyz=_text(phalanx.axis))
+    ET.SubElement(joint, "axis", xyz=urdf.text(phalanx.axis))
     motor = next(motor for motor in hand.MOTORS if motor.name == phalanx.motor)
     ends = [
         phalanx.offset_deg + phalanx.gain * angle
         for angle in (motor.minimum_deg, motor.maximum_deg)
     ]
-    joint.append(_limit(min(ends), max(ends)))
-
-
-def _inertial(
-    mass_kg: float, inertia_kgm2: float, centre_m: Vector = (0.0, 0.0, 0.0)
-) -> ET.Element:
-    inertial = ET.Element("inertial")
-    inertial.append(_origin(centre_m))
-    ET.SubElement(inertial, "mass", value=repr(mass_kg))
-    diagonal = dict.fromkeys(("ixx", "iyy", "izz"), repr(inertia_kgm2))
-    ET.SubElement(inertial, "inertia", {**diagonal, "ixy": "0", "ixz": "0", "iyz": "0"})
-    return inertial
-
-
-def _limit(lower_deg: float, upper_deg: float) -> ET.Element:
-    lower, upper = repr(math.radians(lower_deg)), repr(math.radians(upper_deg))
-    return ET.Element("limit", lower=lower, upper=upper, effort="100", velocity="100")
-
-
-def _origin(xyz: Iterable[float], rpy: Iterable[float] = (0.0, 0.0, 0.0)) -> ET.Element:
-    return ET.Element("origin", xyz=_text(xyz), rpy=_text(rpy))
-
-
-def _text(numbers: Iterable[float]) -> str:
-    return " ".join(repr(float(number)) for number in numbers)
-
-
-def _numbers(text: str) -> tuple[float, ...]:
-    return tuple(float(word) for word in text.split())
-
-
-def rotation_from_rpy(rpy: Iterable[float]) -> NDArray[np.float64]:
-    """Rotation matrix (3, 3) of a URDF's roll, pitch, yaw in radians."""
-    (sr, cr), (sp, cp), (sy, cy) = ((math.sin(angle), math.cos(angle)) for angle in rpy)
-    return np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
-
-
-def _rpy_from_rotation(rotation: NDArray[np.float64]) -> Vector:
-    return (
-        math.atan2(rotation[2, 1], rotation[2, 2]),
-        math.atan2(-rotation[2, 0], math.hypot(rotation[2, 1], rotation[2, 2])),
-        math.atan2(rotation[1, 0], rotation[0, 0]),
-    )
+    joint.append(urdf.limit(min(ends), max(ends)))

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-import sapien
 from numpy.typing import NDArray
 
-from actors.backends.sapien.stage import Stage, material
-from actors.backends.sapien.world import RobotBuilder, World, along
+from actors.backends.sapien.stage import Stage
+from actors.backends.sapien.world import RobotBuilder, World
 from actors.simulator import (
     EYE_HEIGHT,
     Array,
@@ -26,7 +25,7 @@ from actors.simulator import (
 from proto.action import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import SimulatorConfig
 from sim_assets.hand import joints_from_motors, motors_from_joints
-from sim_assets.icub import EYE, Capsule, Collider, Cuboid, build_icub
+from sim_assets.icub import EYE, build_icub
 
 EYE_FOV_DEG: Final = 50.0
 """Vertical field of view of the whole eye image."""
@@ -45,6 +44,7 @@ class SapienSimulator:
     name = "sapien"
 
     def __init__(self, config: SimulatorConfig) -> None:
+        self.control_period_s = config.control_period_s
         self._config = config
         self._model = build_icub()
         self._builder = RobotBuilder(self._model)
@@ -130,7 +130,7 @@ class SapienSimulator:
     def _look(self, crop: Crop, width: int, height: int) -> NDArray[np.float32]:
         """Colours (height, width, 3) in 0..1 of what the eye sees in a crop."""
         if self._eye_stage is None:
-            self._eye_stage = Stage(_collider_shapes(self._model.colliders))
+            self._eye_stage = Stage(self._model.seen_by_eye)
             assert self._scene is not None
             self._eye_stage.set_boxes(self._scene.boxes)
         poses = self._world.poses()
@@ -152,21 +152,3 @@ def _angles_rad(motors_deg: Array) -> Array:
     """Angles (28,) of all joints for the motor angles (18,)."""
     joints_deg = np.concatenate([motors_deg[:9], joints_from_motors(motors_deg[9:])])
     return np.asarray(np.deg2rad(joints_deg), dtype=np.float64)
-
-
-def _collider_shapes(colliders: tuple[Collider, ...]) -> dict[str, list[Any]]:
-    shapes: dict[str, list[Any]] = {}
-    dark = material((0.2, 0.2, 0.22))
-    for collider in colliders:
-        match collider:
-            case Cuboid(_, centre_m, size_m):
-                shape = sapien.render.RenderShapeBox(np.array(size_m) / 2, dark)
-                shape.local_pose = sapien.Pose(centre_m)
-            case Capsule(_, start_m, end_m, radius_m) if start_m == end_m:
-                shape = sapien.render.RenderShapeSphere(radius_m, dark)
-            case Capsule(_, start_m, end_m, radius_m):
-                pose, length_m = along(np.array(start_m), np.array(end_m))
-                shape = sapien.render.RenderShapeCapsule(radius_m, length_m / 2, dark)
-                shape.local_pose = pose
-        shapes.setdefault(collider.link, []).append(shape)
-    return shapes

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sapien import render
 
 from actors.simulator import Box
+from sim_assets.icub_visuals import Visual
 
 Colours = NDArray[np.float32]
 
@@ -24,8 +25,10 @@ Colours = NDArray[np.float32]
 os.environ.setdefault("LP_NUM_THREADS", "0")
 
 AMBIENT: Final = 0.5
-SUN: Final = 0.6
+SUN: Final = 1.2
 SUN_DIRECTION: Final = (0.3, 0.5, -1.0)
+BACKGROUND: Final = np.float32(0.4)
+"""Grey of what lies beyond all bodies: lighter than the hand, darker than the table."""
 NEAR_M: Final = 0.01
 FAR_M: Final = 5.0
 
@@ -33,14 +36,16 @@ FAR_M: Final = 5.0
 class Stage:
     """Bodies made of shapes, lit by a fixed sun without shadows."""
 
-    def __init__(self, robot: Mapping[str, Sequence[Any]]) -> None:
-        """Set the stage with the robot, given as render shapes by link."""
+    def __init__(self, robot: Iterable[Visual]) -> None:
         render.set_camera_shader_dir("minimal")
         self._system = render.RenderSystem()
         self._scene = sapien.Scene([self._system])
         self._system.set_ambient_light([AMBIENT] * 3)
         self._scene.add_entity(_sun())
-        self._robot = {link: self._add(shapes) for link, shapes in robot.items()}
+        shapes: dict[str, list[Any]] = {}
+        for visual in robot:
+            shapes.setdefault(visual.link, []).append(_mesh_shape(visual))
+        self._robot = {link: self._add(parts) for link, parts in shapes.items()}
         self._boxes: dict[str, sapien.Entity] = {}
         self._cameras: dict[tuple[int, int], Any] = {}
 
@@ -71,7 +76,8 @@ class Stage:
         camera.set_perspective_parameters(NEAR_M, FAR_M, focal, focal, width / 2, height / 2, 0.0)
         self._system.step()
         camera.take_picture()
-        return np.asarray(camera.get_picture("Color")[..., :3])
+        image = camera.get_picture("Color")
+        return np.where(image[..., 3:] > 0.0, image[..., :3], BACKGROUND)
 
     def _camera(self, width: int, height: int) -> Any:
         if (width, height) not in self._cameras:
@@ -113,9 +119,13 @@ def _looking_along(direction: NDArray[np.float64]) -> sapien.Pose:
 
 
 def _box_shape(box: Box) -> Any:
-    return render.RenderShapeBox(np.array(box.size_m) / 2, material(box.colour))
+    return render.RenderShapeBox(np.array(box.size_m) / 2, _material(box.colour))
 
 
-def material(colour: Sequence[float]) -> Any:
+def _mesh_shape(visual: Visual) -> Any:
+    return render.RenderShapeTriangleMesh(str(visual.mesh), [1.0] * 3, _material(visual.colour))
+
+
+def _material(colour: Sequence[float]) -> Any:
     """A matt material of a colour in 0..1."""
     return render.RenderMaterial(base_color=[*colour, 1.0])

@@ -62,11 +62,11 @@ def _add_collider(link: Any, collider: Collider, material: Any) -> None:
         case Capsule(_, start_m, end_m, radius_m) if start_m == end_m:
             link.add_sphere_collision(sapien.Pose(start_m), radius_m, material)
         case Capsule(_, start_m, end_m, radius_m):
-            pose, length_m = along(np.array(start_m), np.array(end_m))
+            pose, length_m = _along(np.array(start_m), np.array(end_m))
             link.add_capsule_collision(pose, radius_m, length_m / 2, material)
 
 
-def along(start: Floats, end: Floats) -> tuple[sapien.Pose, float]:
+def _along(start: Floats, end: Floats) -> tuple[sapien.Pose, float]:
     """Pose in the middle of a segment, x along it, and its length."""
     axis = end - start
     length = float(np.linalg.norm(axis))
