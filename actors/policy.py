@@ -8,15 +8,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.tasks.task import Situation
-from proto.episode import Image
+from proto.episode import Floats, Image
 
 
 class Policy(Protocol):
-    """Chooses one action each control step."""
+    """Chooses one action each control step.
+
+    Attributes:
+        name: what it is called in files and results.
+        version: policy version; 0 for what was never trained.
+        looks: whether it uses the picture; if not, nothing need be rendered.
+        target: (11,) what the last action was meant to be, where noise was added to it; else None.
+        outputs: (110,) softmax outputs behind the last action, or None.
+    """
 
     name: str
     version: int
-    """Policy version; 0 for what was never trained."""
+    looks: bool
+    target: NDArray[np.float64] | None
+    outputs: Floats | None
 
     def begin(self, situation: Situation, seed: int) -> None:
         """Start an episode. Only the tutor and the baselines may look at the situation."""

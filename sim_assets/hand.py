@@ -151,10 +151,18 @@ _COUPLING: Final = np.array(
 _OFFSET_DEG: Final = np.array([p.offset_deg for p in PHALANGES])
 _DECOUPLING: Final = np.linalg.pinv(_COUPLING)
 
-OPEN_DEG: Final = np.array([40.0, 85.0, 30.0, 20.0, 0.0, 10.0, 0.0, 10.0, 10.0])
+OPEN_DEG: Final = np.array([60.0, 85.0, 42.0, 50.0, 0.0, 10.0, 0.0, 10.0, 10.0])
 """Motor angles at grasp level 1: a pre-shape somewhat wider than the object."""
-CLOSED_DEG: Final = np.array([40.0, 85.0, 62.0, 64.0, 38.0, 36.0, 38.0, 36.0, 75.0])
+CLOSED_DEG: Final = np.array([60.0, 85.0, 62.0, 64.0, 38.0, 36.0, 38.0, 36.0, 75.0])
 """Motor angles at grasp level 10; contact stops the fingers before they get there."""
+
+_PINCH_TILT: Final = np.deg2rad(75.0)
+GRASP_AXIS: Final = np.array([np.cos(_PINCH_TILT), 0.0, -np.sin(_PINCH_TILT)])
+"""Unit vector in the hand frame from the thumb to the fingers that oppose it."""
+APPROACH_AXIS: Final = np.array([np.sin(_PINCH_TILT), 0.0, np.cos(_PINCH_TILT)])
+"""Unit vector in the hand frame along which the open hand slides over an object."""
+GRASP_CENTRE_M: Final = -0.006 * GRASP_AXIS + 0.060 * APPROACH_AXIS + np.array([0.0, -0.012, 0.0])
+"""Point in the hand frame, midway between thumb and fingers, that meets the object's centre."""
 
 
 def motors_from_grasp(level: float) -> NDArray[np.float64]:

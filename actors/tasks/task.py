@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.simulator import JointTargets, Pose, Scene, StepReport
+from actors.simulator import Pose, Scene, StepReport
 from proto.episode import Outcome
 
 Situation = Mapping[str, float]
@@ -28,9 +28,17 @@ class Judge(Protocol):
 
 
 class Task(Protocol):
-    """A task of the paper."""
+    """A task of the paper.
+
+    Attributes:
+        name: what it is called in configs and files.
+        phases: (T,) uint8, subtask of each control step, counted from 1 as in the paper.
+        start: (11,) action whose posture every episode starts from.
+    """
 
     name: str
+    phases: NDArray[np.uint8]
+    start: NDArray[np.float64]
 
     def tutored(self) -> Sequence[Situation]:
         """The situations that are tutored, always in the same order."""
@@ -44,8 +52,8 @@ class Task(Protocol):
     def check(self, situation: Situation) -> None:
         """Raise UserError unless the situation has this task's values within its ranges."""
 
-    def scene(self, situation: Situation, start: JointTargets) -> Scene:
-        """The scene of a situation, the robot starting at `start`."""
+    def scene(self, situation: Situation) -> Scene:
+        """The scene of a situation."""
 
     def judge(self, situation: Situation) -> Judge:
         """A judge for one episode of the situation."""

@@ -1,0 +1,105 @@
+"""Plays one episode: observe, decide, move, judge (paper, section 3.2)."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.attention import clip_action, crop_of_focus, targets_of_action
+from actors.policy import Policy
+from actors.simulator import Pose, Simulator
+from actors.tasks.task import Situation, Task
+from proto.action import FOCUS
+from proto.episode import Episode, Image, Kind
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LiveStep:
+    """One control step as it happens, for whoever watches.
+
+    Attributes:
+        step: control step, from 0.
+        phase: subtask of the paper, from 1.
+        image: (48, 64) uint8, the network's picture.
+        joints_deg: (18,) measured before the action.
+        action: (11,) what the robot is told.
+    """
+
+    step: int
+    phase: int
+    image: Image
+    joints_deg: Array
+    action: Array
+
+
+def play(
+    simulator: Simulator,
+    task: Task,
+    policy: Policy,
+    situation: Situation,
+    *,
+    seed: int,
+    kind: Kind,
+    actor: str = "local",
+    config_digest: str = "",
+    on_step: Callable[[LiveStep], None] | None = None,
+) -> Episode:
+    """Play one episode from the task's start posture and return everything about it.
+
+    At step t the robot sees images[t] through the crop of its focus level, is told actions[t], and
+    moves for one control period. An exception from `on_step` ends the episode at once.
+    """
+    task.check(situation)
+    simulator.reset(task.scene(situation))
+    judge = task.judge(situation)
+    policy.begin(situation, seed)
+    names = tuple(simulator.bodies())
+    images, actions, targets, joints, poses, outputs = [], [], [], [], [], []
+    focus = float(task.start[FOCUS])
+    for step, phase in enumerate(task.phases):
+        seen = simulator.observe(crop_of_focus(focus))
+        action = clip_action(policy.step(seen.image))
+        poses.append(_pose_rows(simulator.bodies(), names))
+        if on_step is not None:
+            on_step(LiveStep(step, int(phase), seen.image, seen.joints_deg, action))
+        report = simulator.step(targets_of_action(action))
+        judge.watch(report, simulator.joints_deg(), simulator.bodies())
+        images.append(seen.image)
+        actions.append(action)
+        targets.append(action if policy.target is None else policy.target)
+        joints.append(seen.joints_deg)
+        if policy.outputs is not None:
+            outputs.append(policy.outputs)
+        focus = float(action[FOCUS])
+    return Episode(
+        id=uuid.uuid4().hex,
+        kind=kind,
+        task=task.name,
+        situation=dict(situation),
+        seed=seed,
+        actor=actor,
+        backend=simulator.name,
+        policy=policy.name,
+        policy_version=policy.version,
+        config_digest=config_digest,
+        images=np.stack(images),
+        actions=np.asarray(actions, dtype=np.float32),
+        targets=np.asarray(targets, dtype=np.float32),
+        joints_deg=np.asarray(joints, dtype=np.float32),
+        phases=task.phases.copy(),
+        body_names=names,
+        body_poses=np.asarray(poses, dtype=np.float32),
+        outcome=judge.outcome(),
+        outputs=np.asarray(outputs, dtype=np.float32) if outputs else None,
+        control_period_s=simulator.control_period_s,
+    )
+
+
+def _pose_rows(bodies: Mapping[str, Pose], names: tuple[str, ...]) -> list[tuple[float, ...]]:
+    return [(*bodies[name].position_m, *bodies[name].quaternion) for name in names]

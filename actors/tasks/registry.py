@@ -1,0 +1,14 @@
+"""Tasks by name."""
+
+from __future__ import annotations
+
+from actors.tasks.experiment1 import Experiment1
+from actors.tasks.task import Task
+from proto.config import TaskConfig
+
+TASKS = {Experiment1.name: Experiment1}
+
+
+def make_task(config: TaskConfig) -> Task:
+    """Make the task that the configuration names."""
+    return TASKS[config.name]()

@@ -1,0 +1,166 @@
+"""Forward kinematics and clearances of the right arm and the gaze, in the world frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from sim_assets.hand import PHALANGES, joints_from_motors
+from sim_assets.icub import (
+    ARM_JOINTS,
+    EYE,
+    HAND,
+    JOINT_LIMITS_DEG,
+    NECK_JOINTS,
+    Capsule,
+    Collider,
+    build_icub,
+)
+
+Array = NDArray[np.float64]
+
+# Root frame of the iCub: x back, y right, z up. World: x right, y forward, z up.
+_ROOT_IN_WORLD: Final = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class Cuboid:
+    """A box that the arm must stay clear of, or may come close to.
+
+    Attributes:
+        centre_m: (3,) centre in the world frame.
+        size_m: (3,) full edge lengths.
+        yaw_rad: turn about the vertical.
+    """
+
+    centre_m: Array
+    size_m: Array
+    yaw_rad: float = 0.0
+
+    def distance(self, points: Array) -> Array:
+        """Signed distances (N,) of points (N, 3) from the surface; negative inside (m)."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        local = (points - self.centre_m) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        beyond = np.abs(local) - np.asarray(self.size_m) / 2
+        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+        return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0))
+
+
+@dataclass(frozen=True)
+class ArmPose:
+    """Where the arm is in one posture.
+
+    Attributes:
+        rotation: (3, 3) of the hand frame in the world.
+        position_m: (3,) of the hand frame.
+        points_m: (N, 3) points on the axes of the colliders.
+    """
+
+    rotation: Array
+    position_m: Array
+    points_m: Array
+
+
+class Arm:
+    """The right arm with the hand held at fixed motor angles."""
+
+    def __init__(self, motors_deg: Array, table_drop_m: float) -> None:
+        """Freeze all joints but the arm's seven.
+
+        Args:
+            motors_deg: (9,) hand motors.
+            table_drop_m: how far the table top (world z = 0) lies below the root link.
+        """
+        model = build_icub()
+        full = pin.buildModelFromUrdf(str(model.urdf))
+        posture = pin.neutral(full)
+        angles = np.deg2rad(joints_from_motors(motors_deg))
+        for phalanx, angle in zip(PHALANGES, angles, strict=True):
+            posture[full.joints[full.getJointId(phalanx.joint)].idx_q] = angle
+        moving = {full.getJointId(name) for name in ARM_JOINTS}
+        frozen = [joint for joint in range(1, full.njoints) if joint not in moving]
+        self._model = pin.buildReducedModel(full, frozen, posture)
+        self._data = self._model.createData()
+        self._offset_m = np.array([0.0, 0.0, table_drop_m])
+        self._hand = self._model.getFrameId(HAND)
+        self._clouds = self._collider_clouds(model.colliders)
+        limits = np.deg2rad([JOINT_LIMITS_DEG[name] for name in ARM_JOINTS])
+        self.minimum_rad: Array = limits[:, 0]
+        self.maximum_rad: Array = limits[:, 1]
+        self.radii_m = np.concatenate([cloud[2] for cloud in self._clouds])
+        self.of_hand = np.concatenate(
+            [np.full(len(cloud[2]), cloud[0] == self._model.njoints - 1) for cloud in self._clouds]
+        )
+        """Which points (N,) belong to palm and fingers; the others to the arm."""
+
+    def _collider_clouds(self, colliders: tuple[Collider, ...]) -> list[tuple[int, Array, Array]]:
+        clouds = []
+        for collider in colliders:
+            frame = self._model.frames[self._model.getFrameId(collider.link)]
+            points, radius = _sample(collider)
+            placed = points @ frame.placement.rotation.T + frame.placement.translation
+            clouds.append((frame.parentJoint, placed, np.full(len(points), radius)))
+        return clouds
+
+    def pose(self, posture_rad: Array) -> ArmPose:
+        """Forward kinematics of joint angles (7,) in radians."""
+        pin.forwardKinematics(self._model, self._data, posture_rad)
+        hand = pin.updateFramePlacement(self._model, self._data, self._hand)
+        points = np.concatenate(
+            [
+                cloud @ self._data.oMi[joint].rotation.T + self._data.oMi[joint].translation
+                for joint, cloud, _ in self._clouds
+            ]
+        )
+        return ArmPose(
+            rotation=_ROOT_IN_WORLD @ hand.rotation,
+            position_m=_ROOT_IN_WORLD @ hand.translation + self._offset_m,
+            points_m=points @ _ROOT_IN_WORLD.T + self._offset_m,
+        )
+
+
+def _sample(collider: Collider, spacing_m: float = 0.015) -> tuple[Array, float]:
+    """Points (N, 3) on the axis of a capsule, or inside a box, and the radius around them."""
+    if isinstance(collider, Capsule):
+        start, end = np.array(collider.start_m), np.array(collider.end_m)
+        count = 2 + int(np.linalg.norm(end - start) / spacing_m)
+        return start + np.linspace(0.0, 1.0, count)[:, None] * (end - start), collider.radius_m
+    half = np.array(collider.size_m) / 2
+    radius = float(half.min())
+    grid = [np.linspace(-h, h, 2 + int(2 * h / 0.02)) for h in half - radius]
+    return np.array(collider.centre_m) + np.stack(np.meshgrid(*grid), -1).reshape(-1, 3), radius
+
+
+class Gaze:
+    """The neck, and where the left eye looks."""
+
+    def __init__(self, table_drop_m: float) -> None:
+        """Freeze all joints but the neck's two."""
+        full = pin.buildModelFromUrdf(str(build_icub().urdf))
+        moving = {full.getJointId(name) for name in NECK_JOINTS}
+        frozen = [joint for joint in range(1, full.njoints) if joint not in moving]
+        self._model = pin.buildReducedModel(full, frozen, pin.neutral(full))
+        self._data = self._model.createData()
+        self._eye = self._model.getFrameId(EYE)
+        self._offset_m = np.array([0.0, 0.0, table_drop_m])
+        self._limits = np.deg2rad([JOINT_LIMITS_DEG[name] for name in NECK_JOINTS]).T
+
+    def neck_deg(self, point_m: Array) -> Array:
+        """Neck pitch and yaw (2,) in degrees that bring a world point to the middle of the eye.
+
+        Out of the neck's reach, the point comes as near to the middle as it can.
+        """
+
+        def off_axis(neck_rad: Array) -> Array:
+            pin.forwardKinematics(self._model, self._data, neck_rad)
+            eye = pin.updateFramePlacement(self._model, self._data, self._eye)
+            seen = eye.actInv(_ROOT_IN_WORLD.T @ (point_m - self._offset_m))
+            return np.asarray(seen[1:] / np.linalg.norm(seen))
+
+        solution = least_squares(off_axis, np.zeros(2), bounds=self._limits)
+        return np.asarray(np.rad2deg(solution.x))
