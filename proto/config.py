@@ -171,9 +171,9 @@ class EvaluatorConfig(_Section):
 
 
 class RecorderConfig(_Section):
-    """What is kept of the rollouts on disk."""
+    """What is kept of the rollouts on disk: all of them, or only those that are trials."""
 
-    rollouts: bool = True
+    practice: bool = True
 
 
 class DoneConfig(_Section):

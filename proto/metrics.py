@@ -178,7 +178,7 @@ class RecorderMetrics(Metrics):
     Attributes:
         episodes: episodes written since it started.
         bytes: bytes written since it started.
-        dropped: live frames that it could not keep up with.
+        dropped: rollouts that it could not keep up with, or not write.
     """
 
     role: Role = Role.RECORDER

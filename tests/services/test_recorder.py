@@ -1,0 +1,147 @@
+"""A real recorder process on a real bus keeps every rollout once."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ports import free_endpoint
+
+from proto.bus import Bus, open_bus, open_hub
+from proto.config import HubConfig
+from proto.episode import Episode, Kind
+from proto.keys import Role
+from proto.messages import Rollout
+from proto.metrics import RecorderMetrics
+from proto.recording import read_episode
+
+MakeEpisode = Callable[..., Episode]
+
+RUN = "recorded"
+
+
+@pytest.fixture
+def hub() -> Iterator[HubConfig]:
+    config = HubConfig(endpoint=free_endpoint())
+    with open_hub(config, RUN, "hub"):
+        yield config
+
+
+@contextmanager
+def recorder(hub: HubConfig, folder: Path, *settings: str) -> Iterator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-m", "services.cli", "recorder", "--connect", hub.endpoint]
+    for setting in (f"run.folder={folder}", f"run.name={RUN}", *settings):
+        command += ["--set", setting]
+    process = subprocess.Popen(command)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+class Listener:
+    """What the recorder tells about itself."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._told: RecorderMetrics | None = None
+        self._changed = threading.Condition()
+        bus.subscribe(bus.keys.metrics(Role.RECORDER), self._listen, RecorderMetrics)
+
+    def wait_for(self, ready: Callable[[RecorderMetrics], bool]) -> RecorderMetrics:
+        """The first metrics that are as they should be."""
+
+        def told() -> bool:
+            return self._told is not None and ready(self._told)
+
+        with self._changed:
+            assert self._changed.wait_for(told, timeout=60), f"the last metrics: {self._told}"
+            assert self._told is not None
+            return self._told
+
+    def forget(self) -> None:
+        with self._changed:
+            self._told = None
+
+    def _listen(self, metrics: RecorderMetrics) -> None:
+        with self._changed:
+            self._told = metrics
+            self._changed.notify_all()
+
+
+@pytest.fixture
+def rollout(make_episode: MakeEpisode) -> Callable[..., Rollout]:
+    def make(name: str, trial: int | None = 0) -> Rollout:
+        episode = make_episode(
+            20,
+            id=name,
+            kind=Kind.PRACTICE if trial is None else Kind.TRIAL,
+            outputs=np.full((20, 110), 0.1, dtype=np.float32),
+        )
+        return Rollout(episode=episode, run_id="training", trial=trial)
+
+    return make
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / RUN / "rollouts").iterdir())
+
+
+def test_every_rollout_is_kept_once(
+    hub: HubConfig, rollout: Callable[..., Rollout], tmp_path: Path
+) -> None:
+    with open_bus(hub, RUN, Role.ACTOR, "actor") as bus, recorder(hub, tmp_path) as process:
+        listener = Listener(bus)
+        listener.wait_for(lambda told: told.episodes == 0)
+        sent = [rollout(f"rollout{number}", number or None) for number in range(5)]
+        for message in [*sent, *sent[:2]]:
+            bus.deliver(bus.keys.rollout("actor"), message)
+        told = listener.wait_for(lambda told: told.episodes == 5)
+        assert (told.dropped, told.refused) == (0, 0)
+        assert files(tmp_path) == [f"rollout{number}.mcap" for number in range(5)]
+        kept = read_episode(tmp_path / RUN / "rollouts" / "rollout3.mcap")
+        assert np.array_equal(kept.images, sent[3].episode.images)
+        assert kept.outcome == sent[3].episode.outcome
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(timeout=30) == 0
+
+
+def test_a_restarted_recorder_carries_on_and_keeps_trials_only_if_told(
+    hub: HubConfig, rollout: Callable[..., Rollout], tmp_path: Path
+) -> None:
+    with open_bus(hub, RUN, Role.ACTOR, "actor") as bus:
+        listener = Listener(bus)
+        for number in (0, 1):
+            with recorder(hub, tmp_path, "recorder.practice=false") as process:
+                listener.wait_for(lambda told: told.episodes == 0)
+                bus.deliver(bus.keys.rollout("actor"), rollout("practised", None))
+                bus.deliver(bus.keys.rollout("actor"), rollout("before", 7))
+                bus.deliver(bus.keys.rollout("actor"), rollout(f"during{number}", number))
+                # the second time, `before` is there already
+                listener.wait_for(lambda told, number=number: told.episodes == 2 - number)
+                process.kill()
+                process.wait()
+                listener.forget()
+    assert files(tmp_path) == ["before.mcap", "during0.mcap", "during1.mcap"]
+
+
+def test_without_a_hub_it_says_so(tmp_path: Path) -> None:
+    result = subprocess.run(
+        [
+            *(sys.executable, "-m", "services.cli", "recorder", "--connect", free_endpoint()),
+            *("--set", f"run.folder={tmp_path}"),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert result.returncode == 2
+    assert "no hub answers" in result.stderr
