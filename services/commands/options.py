@@ -25,14 +25,19 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_process(parser: argparse.ArgumentParser) -> None:
-    """Add --config, --set, --connect and --id, for a process on the bus."""
+def add_connection(parser: argparse.ArgumentParser) -> None:
+    """Add --config, --set and --connect, for whatever looks at the bus."""
     add_config(parser)
     parser.add_argument(
         "--connect",
         metavar="tcp/HOST:PORT",
         help="where the hub listens; without it, the config's hub.endpoint",
     )
+
+
+def add_process(parser: argparse.ArgumentParser) -> None:
+    """Add --config, --set, --connect and --id, for a process on the bus."""
+    add_connection(parser)
     parser.add_argument("--id", type=_id, help="what this process is called on the bus")
 
 

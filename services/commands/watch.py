@@ -1,0 +1,57 @@
+"""`vmdnn watch`: see what all processes of a run are doing."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from typing import Final
+
+from rich.console import Console
+
+from proto.bus import open_bus
+from proto.keys import Role
+from proto.process import METRICS_PERIOD_S, Lifecycle
+from services.commands.options import add_connection, config_of
+from services.watch import Board, View, display, tables
+
+ONCE_WITHIN_S: Final = 2.5 * METRICS_PERIOD_S
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    add_connection(parser)
+    parser.add_argument("--once", action="store_true", help="show what is known now, and end")
+    parser.add_argument("--json", action="store_true", help="with --once: print JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Watch until Ctrl-C, or once."""
+    config = config_of(arguments)
+    with open_bus(config.hub, config.run.name, Role.WATCH, f"watch-{os.getpid()}") as bus:
+        board = Board(bus)
+        if arguments.once:
+            return _show_once(board.wait_until_all_told(ONCE_WITHIN_S), arguments.json)
+        lifecycle = Lifecycle()
+        lifecycle.stop_on_signals()
+        with display(Console()) as show:
+            while not lifecycle.stopping:
+                show(board.view())
+                lifecycle.wait(METRICS_PERIOD_S)
+    return 0
+
+
+def _show_once(view: View, as_json: bool) -> int:
+    if not view.metrics:
+        print(
+            f"no process of run {view.run!r} tells anything; is that the run's name? "
+            "Name another with --set run.name=NAME or --config RUN/config.yaml",
+            file=sys.stderr,
+        )
+        return 1
+    if as_json:
+        print(json.dumps(view.as_json(), indent=2))
+    else:
+        Console().print(tables(view))
+    return 0
