@@ -78,11 +78,14 @@ class Supervisor:
     """Starts programs when told to, and stops all in the reverse of their order on leaving.
 
     It must be entered on the main thread: the kernel ties the processes' lives to that thread.
+
+    Attributes:
+        programs: what it starts and stops, in this order.
     """
 
     def __init__(self, programs: Sequence[Program], folder: Path) -> None:
         """Make a supervisor that keeps its config and the logs of all in `folder`."""
-        self._programs = programs
+        self.programs = programs
         self._folder = folder.resolve()
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -92,7 +95,7 @@ class Supervisor:
         self._socket_folder = tempfile.TemporaryDirectory(prefix="vmdnn-")
         socket = Path(self._socket_folder.name) / "supervisord.sock"
         config = self._folder / "supervisord.conf"
-        config.write_text(supervisord_config(self._programs, self._folder, socket))
+        config.write_text(supervisord_config(self.programs, self._folder, socket))
         self._socket = socket
         self._process = subprocess.Popen(
             (*_DIES_WITH_PARENT, sys.executable, "-m", "supervisor.supervisord", "-c", config),
@@ -140,7 +143,7 @@ class Supervisor:
             return
         self._process.terminate()
         try:
-            self._process.wait(timeout=sum(p.stop_within_s for p in self._programs) + 10)
+            self._process.wait(timeout=sum(p.stop_within_s for p in self.programs) + 10)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

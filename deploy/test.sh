@@ -3,6 +3,7 @@
 # Arguments go to pytest: `deploy/test.sh -m slow`, `deploy/test.sh tests/learner -k gradient`.
 set -euo pipefail
 
+# shellcheck source=deploy/setup.sh
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
 setup
 cd "$ROOT"

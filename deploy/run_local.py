@@ -1,0 +1,250 @@
+"""A whole run on this machine: start everything, show it, stop it, say how it went."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+
+from deploy.supervision import BAD_INPUT, ProcessState, Program, Supervisor
+from proto.bus import Bus, open_bus
+from proto.config import Config, DoneConfig, load_config
+from proto.errors import UserError
+from proto.keys import Role
+from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
+from proto.process import METRICS_PERIOD_S, Lifecycle
+from services.ports import port_trouble
+from services.watch import Board, View, display, success_words
+
+DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
+VMDNN: Final = str(Path(sys.executable).with_name("vmdnn"))
+
+HUB_WITHIN_S: Final = 30.0
+TOO_MANY_CRASHES: Final = 5
+TOO_SHORT_S: Final = 60.0
+"""A process that crashes so many times within so short a time is not worth another start."""
+
+
+class ProcessFailedError(Exception):
+    """A process ended for good, or crashes again and again."""
+
+    def __init__(self, process: ProcessState, what: str) -> None:
+        lines = process.log.read_text(errors="replace").splitlines() if process.log.exists() else []
+        last = "\n".join(f"    {line}" for line in lines[-12:])
+        super().__init__(f"{process.name} {what}; the end of {process.log}:\n{last}")
+        self.exit_status = BAD_INPUT if process.exit_status == BAD_INPUT else 1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run until done or told to stop; the result is the exit status."""
+    arguments = _parser().parse_args(argv)
+    try:
+        overrides = list(arguments.overrides)
+        if arguments.backend is not None:
+            overrides.append(f"simulator.backend={arguments.backend}")
+        config = load_config(arguments.config, overrides)
+        actors = default_actors(config) if arguments.actors is None else arguments.actors
+        if trouble := port_trouble(config.hub.endpoint):
+            raise UserError(trouble)
+        run(config, actors, Console())
+    except UserError as error:
+        print(f"run_local: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except ProcessFailedError as error:
+        print(f"run_local: {error}", file=sys.stderr)
+        return error.exit_status
+    return 0
+
+
+def default_actors(config: Config) -> int:
+    """One actor for each core that the learner leaves, at least one."""
+    return max(1, len(os.sched_getaffinity(0)) - config.learner.threads)
+
+
+def run(config: Config, actors: int, console: Console) -> None:
+    """Play a run with so many actors until it is done or this process is told to stop.
+
+    Raises:
+        UserError: the run's folder cannot be used.
+        ProcessFailedError: one of the processes cannot go on.
+    """
+    started_s = time.monotonic()
+    lifecycle = Lifecycle()
+    lifecycle.stop_on_signals()
+    file = config.run_folder / "config.yaml"
+    known = file.exists()
+    config.save(file)
+    console.print(
+        f"{'going on with' if known else 'starting'} run {config.run.name} with {actors} "
+        f"{'actor' if actors == 1 else 'actors'} in {config.run_folder}",
+        highlight=False,
+    )
+    with Supervisor(programs(config, file, actors), config.run_folder / "logs") as supervisor:
+        supervisor.start("hub")
+        with _connect(config, supervisor, lifecycle) as bus:
+            for program in supervisor.programs[1:]:
+                supervisor.start(program.name)
+            view = _follow(Board(bus), supervisor, config, lifecycle, console)
+        console.print("stopping", highlight=False)
+    console.print(summary(view, config, time.monotonic() - started_s), highlight=False)
+
+
+def programs(config: Config, file: Path, actors: int) -> list[Program]:
+    """What a run is made of, in the order of starting."""
+
+    def vmdnn(role: Role) -> tuple[str, ...]:
+        return (VMDNN, role.value, "--config", str(file))
+
+    started = [
+        Program("hub", vmdnn(Role.HUB)),
+        Program(
+            "learner",
+            vmdnn(Role.LEARNER),
+            threads=config.learner.threads,
+            stop_within_s=30,  # it saves its state
+        ),
+        Program("evaluator", vmdnn(Role.EVALUATOR)),
+        Program("recorder", vmdnn(Role.RECORDER)),
+    ]
+    if actors:
+        started.append(Program("actor", vmdnn(Role.ACTOR), processes=actors))
+    return started
+
+
+def is_done(view: View, done: DoneConfig) -> bool:
+    """Whether learner and evaluator both say that they have reached what `done` asks for."""
+    if done == DoneConfig():
+        return False
+    learners = view.living(LearnerMetrics)
+    evaluators = view.living(EvaluatorMetrics)
+    done_so_far = [*(m.done for m in learners), *(m.done for m in evaluators)]
+    return bool(learners) and bool(evaluators) and all(done_so_far)
+
+
+class Crashes:
+    """Counts how often processes had to be started again."""
+
+    def __init__(self) -> None:
+        """Start with none."""
+        self._started_s: dict[str, int] = {}
+        self._crashes_s: defaultdict[str, deque[int]] = defaultdict(
+            lambda: deque(maxlen=TOO_MANY_CRASHES)
+        )
+
+    def look(self, processes: Iterable[ProcessState]) -> list[ProcessState]:
+        """Which processes have come back since the last look.
+
+        Raises:
+            ProcessFailedError: one of them cannot be helped by starting it again.
+        """
+        back = []
+        for process in processes:
+            if process.gave_up:
+                raise ProcessFailedError(process, "cannot go on")
+            before_s = self._started_s.get(process.name, 0)
+            self._started_s[process.name] = process.started_s
+            if before_s and process.started_s != before_s:
+                back.append(process)
+                crashes_s = self._crashes_s[process.name]
+                crashes_s.append(process.started_s)
+                if len(crashes_s) == TOO_MANY_CRASHES and _span(crashes_s) < TOO_SHORT_S:
+                    raise ProcessFailedError(process, "crashes again and again")
+        return back
+
+
+def summary(view: View, config: Config, wall_s: float) -> str:
+    """How a run went, in a few lines."""
+    minutes, seconds = divmod(round(wall_s), 60)
+    lines = [
+        f"run {config.run.name}: {view.policy_version} policy versions"
+        f" in {minutes} min {seconds} s",
+        *_score_lines(_newest_counted(view.scores, config), config),
+        f"files: {config.run_folder}/ with config.yaml, tutoring, checkpoints, policies, "
+        "rollouts, evaluation, logs",
+    ]
+    return "\n".join(lines)
+
+
+def _follow(
+    board: Board, supervisor: Supervisor, config: Config, lifecycle: Lifecycle, console: Console
+) -> View:
+    """Show what happens until the run is done or should stop; the last view."""
+    crashes = Crashes()
+    with display(console) as show:
+        while True:
+            view = board.view()
+            show(view)
+            for process in crashes.look(supervisor.processes()):
+                console.print(f"{process.name} crashed and is back; see {process.log}")
+            if lifecycle.stopping or is_done(view, config.done):
+                return view
+            lifecycle.wait(METRICS_PERIOD_S)
+
+
+def _connect(config: Config, supervisor: Supervisor, lifecycle: Lifecycle) -> Bus:
+    deadline = time.monotonic() + HUB_WITHIN_S
+    crashes = Crashes()
+    while True:
+        try:
+            return open_bus(config.hub, config.run.name, Role.WATCH, f"run-local-{os.getpid()}")
+        except UserError:
+            crashes.look(supervisor.processes())
+            if lifecycle.stopping or time.monotonic() > deadline:
+                raise
+
+
+def _newest_counted(scores: Sequence[PolicyScore], config: Config) -> PolicyScore | None:
+    """The newest policy with all its trials counted; where there is none, the newest with any."""
+    whole = [score for score in scores if score.trials >= config.evaluator.trials_per_policy]
+    return max(whole or scores, key=lambda score: score.version, default=None)
+
+
+def _score_lines(score: PolicyScore | None, config: Config) -> list[str]:
+    if score is None:
+        return ["no trial was counted"]
+    counted = f"{score.trials} of {config.evaluator.trials_per_policy} trials counted"
+    return [
+        f"policy {score.version}, {counted}; successes, rate and its 95 % interval:",
+        *(
+            f"  {name:8} {success_words(success, score.trials)}"
+            for name, success in (
+                ("lenient", score.lenient),
+                ("strict", score.strict),
+                ("precise", score.precise),
+            )
+        ),
+    ]
+
+
+def _span(times_s: Sequence[int]) -> int:
+    return times_s[-1] - times_s[0]
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="run_local", add_help=False)  # run_local.sh has the help
+    parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG)
+    parser.add_argument("--actors", type=_at_least(0))
+    parser.add_argument("--backend")
+    parser.add_argument("--set", dest="overrides", action="append", default=[])
+    return parser
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    def number(text: str) -> int:
+        value = int(text)
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{text} is less than {least}")
+        return value
+
+    return number
+
+
+if __name__ == "__main__":
+    sys.exit(main())

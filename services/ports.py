@@ -1,0 +1,33 @@
+"""Whether the hub could listen where it is told to."""
+
+from __future__ import annotations
+
+import errno
+import socket
+
+
+def port_trouble(endpoint: str) -> str | None:
+    """Why nothing can listen at an endpoint such as `tcp/127.0.0.1:7447`, and what to do.
+
+    None where it can.
+    """
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.rpartition(":")
+    kind = socket.SOCK_DGRAM if protocol in {"udp", "quic"} else socket.SOCK_STREAM
+    try:
+        family, _, _, _, place = socket.getaddrinfo(host.strip("[]"), int(port), type=kind)[0]
+        with socket.socket(family, kind) as probe:
+            if kind == socket.SOCK_STREAM:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(place)
+    except (OSError, OverflowError) as error:
+        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+            return (
+                f"hub.endpoint: {endpoint} is in use, perhaps by another run. Stop that one, or "
+                f"choose another port with --set hub.endpoint={protocol}/{host}:PORT"
+            )
+        return (
+            f"hub.endpoint: nothing can listen at {endpoint} on this machine ({error}). Set "
+            f"hub.endpoint to an address of this machine, such as {protocol}/127.0.0.1:7447"
+        )
+    return None
