@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from trimesh.exchange.ply import export_ply
 
 from sim_assets import hand
-from sim_assets.urdf import Matrix, Tree, find, numbers, origin_pose
+from sim_assets.urdf import Matrix, Tree, Vector, find, numbers, origin_pose
 
 Colour = tuple[float, float, float]
 Look = Literal["eye", "outside"]
@@ -46,9 +46,9 @@ CREASE_DEG: Final = 35.0
 
 # The left arm and the legs do not move in any task; they only stand there to be seen.
 STANDING_POSTURE_DEG: Final[Mapping[str, float]] = {
-    "l_shoulder_pitch": -5.0,
-    "l_shoulder_roll": 15.0,
-    "l_elbow": 30.0,
+    "l_shoulder_pitch": 10.0,
+    "l_shoulder_roll": 12.0,
+    "l_elbow": 16.0,
 }
 _DECORATION: Final = ("l_", "r_hip", "r_upper_leg", "r_lower_leg", "r_ankle", "r_foot", "r_sole")
 
@@ -57,6 +57,7 @@ _DECORATION: Final = ("l_", "r_hip", "r_upper_leg", "r_lower_leg", "r_ankle", "r
 _OFFICIAL_RED: Final = "0.635 0.137 0.114"
 _COVERS: Final[Colour] = (0.20, 0.03, 0.03)
 _BODY: Final[Colour] = (0.75, 0.75, 0.75)
+_EYEBALL: Final[Colour] = (0.95, 0.95, 0.95)
 _SHELL: Final[Colour] = (0.03, 0.03, 0.035)
 _METAL: Final[Colour] = (0.16, 0.16, 0.17)
 _TIP: Final[Colour] = (0.05, 0.05, 0.055)
@@ -96,7 +97,7 @@ def write_visuals(folder: Path, source: Tree, meshes: Path, links: Iterable[str]
     kept = [link for link in links if link != "r_hand"]  # ours replaces the official hand
     official = list(_official_parts(source, meshes, kept))
     ours = list(_hand_parts())
-    decoration = list(_decoration_parts(source, meshes))
+    decoration = [*_decoration_parts(source, meshes), *_eyeball_parts()]
     seen = [_simplified(part, EYE_FACES) for part in official if part.link in EYE_LINKS]
     sets: dict[Look, list[_Part]] = {
         "eye": seen + [_simplified(part, EYE_HAND_FACES) for part in ours],
@@ -158,6 +159,13 @@ def _decoration_parts(source: Tree, meshes: Path) -> Iterator[_Part]:
         yield _Part("root_link", part.mesh, part.colour)
 
 
+def _eyeball_parts() -> Iterator[_Part]:
+    """Eyes for the official head, which has none."""
+    for x in (-0.034, 0.034):
+        yield _Part("head", _ball(0.016, (x, 0.099, 0.057)), _EYEBALL)
+        yield _Part("head", _ball(0.008, (x, 0.097, 0.067)), _SHELL)
+
+
 def _mesh_path(uri: str, meshes: Path) -> Path:
     return meshes / uri.removeprefix("package://")
 
@@ -210,6 +218,12 @@ def _knuckle(axis: tuple[float, float, float]) -> trimesh.Trimesh:
     return _cylinder(0.0048, -half, half)
 
 
+def _ball(radius_m: float, centre_m: Vector) -> trimesh.Trimesh:
+    ball: trimesh.Trimesh = trimesh.creation.icosphere(subdivisions=2, radius=radius_m)
+    ball.apply_translation(centre_m)
+    return ball
+
+
 def _cylinder(
     radius_m: float, start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> trimesh.Trimesh:
@@ -221,9 +235,8 @@ def _cylinder(
 
 def _bone(length_m: float, start_radius_m: float, end_radius_m: float) -> trimesh.Trimesh:
     """A capsule along x from the origin, tapered."""
-    start = trimesh.creation.icosphere(subdivisions=2, radius=start_radius_m)
-    end = trimesh.creation.icosphere(subdivisions=2, radius=end_radius_m)
-    end.apply_translation((length_m, 0.0, 0.0))
+    start = _ball(start_radius_m, (0.0, 0.0, 0.0))
+    end = _ball(end_radius_m, (length_m, 0.0, 0.0))
     return _hull(np.vstack([start.vertices, end.vertices]))
 
 

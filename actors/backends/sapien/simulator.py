@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from actors.backends.sapien.stage import Stage
+from actors.backends.sapien.stage import Colours, Stage, looking_at
 from actors.backends.sapien.world import RobotBuilder, World
 from actors.simulator import (
     EYE_HEIGHT,
@@ -26,11 +25,16 @@ from proto.action import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import SimulatorConfig
 from sim_assets.hand import joints_from_motors, motors_from_joints
 from sim_assets.icub import EYE, build_icub
+from sim_assets.icub_visuals import Visual
 
 EYE_FOV_DEG: Final = 50.0
 """Vertical field of view of the whole eye image."""
 SUPERSAMPLING: Final = 3
 """Rendered pixels along each side of one pixel of the network's picture."""
+OUTSIDE_POSE: Final = looking_at((-0.7, 1.0, 0.55), (0.09, 0.12, 0.11))
+"""From the robot's left front, a little above it (world frame, m)."""
+OUTSIDE_FOV_DEG: Final = 52.0
+OUTSIDE_SUPERSAMPLING: Final = 2
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # Rec. 601
 _STATIC_LINKS: Final = frozenset({"root_link", "torso_1", "torso_2", "chest"})
 
@@ -109,6 +113,24 @@ class SapienSimulator:
             if name not in _STATIC_LINKS
         }
 
+    def show(self, joints_deg: Array, boxes: Mapping[str, Pose]) -> None:
+        """Put a recorded state on the stage for pictures; not for use during an episode."""
+        self._world.put(_angles_rad(joints_deg), boxes)
+
+    def eye_picture(self, crop: Crop, width: int, height: int) -> Image:
+        """Colour picture (height, width, 3) uint8 of the left eye's crop."""
+        return _bytes(self._look(crop, width, height))
+
+    def outside_picture(self, width: int, height: int) -> Image:
+        """Colour picture (height, width, 3) uint8 of the scene from outside, full meshes."""
+        if self._outside_stage is None:
+            self._outside_stage = self._make_stage(self._model.seen_from_outside)
+        self._outside_stage.place(self._world.poses())
+        focal = height / 2 / math.tan(math.radians(OUTSIDE_FOV_DEG / 2))
+        size = (OUTSIDE_SUPERSAMPLING * width, OUTSIDE_SUPERSAMPLING * height)
+        fine = self._outside_stage.picture(OUTSIDE_POSE, *size, OUTSIDE_SUPERSAMPLING * focal)
+        return _bytes(_averaged(fine, OUTSIDE_SUPERSAMPLING))
+
     def close(self) -> None:
         """Free what the simulator holds."""
         self._world_now = self._eye_stage = self._outside_stage = None
@@ -121,22 +143,35 @@ class SapienSimulator:
 
     def _grey(self, crop: Crop) -> Image:
         """What the eye sees in a crop, averaged to (48, 64) uint8."""
-        factor = SUPERSAMPLING
-        colours = self._look(crop, IMAGE_WIDTH * factor, IMAGE_HEIGHT * factor)
-        fine = (colours @ _LUMA).reshape(IMAGE_HEIGHT, factor, IMAGE_WIDTH, factor)
-        grey: Image = np.rint(255.0 * fine.mean(axis=(1, 3))).astype(np.uint8)
-        return grey
+        size = (SUPERSAMPLING * IMAGE_WIDTH, SUPERSAMPLING * IMAGE_HEIGHT)
+        return _bytes(_averaged(self._look(crop, *size) @ _LUMA, SUPERSAMPLING))
 
-    def _look(self, crop: Crop, width: int, height: int) -> NDArray[np.float32]:
+    def _look(self, crop: Crop, width: int, height: int) -> Colours:
         """Colours (height, width, 3) in 0..1 of what the eye sees in a crop."""
         if self._eye_stage is None:
-            self._eye_stage = Stage(self._model.seen_by_eye)
-            assert self._scene is not None
-            self._eye_stage.set_boxes(self._scene.boxes)
+            self._eye_stage = self._make_stage(self._model.seen_by_eye)
         poses = self._world.poses()
         self._eye_stage.place(poses)
         whole = EYE_HEIGHT / 2 / math.tan(math.radians(EYE_FOV_DEG / 2))
         return self._eye_stage.picture(poses[EYE], width, height, whole * height / crop.height)
+
+    def _make_stage(self, robot: tuple[Visual, ...]) -> Stage:
+        stage = Stage(robot)
+        if self._scene is not None:
+            stage.set_boxes(self._scene.boxes)
+        return stage
+
+
+def _averaged(fine: Colours, factor: int) -> Colours:
+    """Mean over blocks of factor x factor pixels."""
+    height, width = fine.shape[0] // factor, fine.shape[1] // factor
+    blocks = fine.reshape(height, factor, width, factor, *fine.shape[2:])
+    return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float32)
+
+
+def _bytes(values: Colours) -> Image:
+    """0..1 to 0..255."""
+    return np.asarray(np.rint(255.0 * values), dtype=np.uint8)
 
 
 def _black() -> Image:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -24,9 +25,7 @@ Colours = NDArray[np.float32]
 # Mesa's software renderer otherwise starts a thread for each core, and actors fight for them.
 os.environ.setdefault("LP_NUM_THREADS", "0")
 
-AMBIENT: Final = 0.5
-SUN: Final = 1.2
-SUN_DIRECTION: Final = (0.3, 0.5, -1.0)
+SHADER: Final = Path(__file__).parent / "shader"
 BACKGROUND: Final = np.float32(0.4)
 """Grey of what lies beyond all bodies: lighter than the hand, darker than the table."""
 NEAR_M: Final = 0.01
@@ -34,14 +33,11 @@ FAR_M: Final = 5.0
 
 
 class Stage:
-    """Bodies made of shapes, lit by a fixed sun without shadows."""
+    """Bodies made of shapes under a light that never changes (see `shader/`)."""
 
     def __init__(self, robot: Iterable[Visual]) -> None:
-        render.set_camera_shader_dir("minimal")
         self._system = render.RenderSystem()
         self._scene = sapien.Scene([self._system])
-        self._system.set_ambient_light([AMBIENT] * 3)
-        self._scene.add_entity(_sun())
         shapes: dict[str, list[Any]] = {}
         for visual in robot:
             shapes.setdefault(visual.link, []).append(_mesh_shape(visual))
@@ -63,7 +59,7 @@ class Stage:
             entity.set_pose(poses[name])
 
     def picture(self, eye: sapien.Pose, width: int, height: int, focal: float) -> Colours:
-        """Take a picture (height, width, 3) float32 in 0..1 from a pose.
+        """Take a picture (height, width, 3) float32 in 0..1, sRGB, from a pose.
 
         Args:
             eye: x along the optical axis, y left, z up.
@@ -82,7 +78,7 @@ class Stage:
     def _camera(self, width: int, height: int) -> Any:
         if (width, height) not in self._cameras:
             entity = sapien.Entity()
-            camera = render.RenderCameraComponent(width, height)
+            camera = render.RenderCameraComponent(width, height, str(SHADER))
             entity.add_component(camera)
             self._scene.add_entity(entity)
             self._cameras[width, height] = camera
@@ -98,23 +94,15 @@ class Stage:
         return entity
 
 
-def _sun() -> sapien.Entity:
-    entity = sapien.Entity()
-    light = render.RenderDirectionalLightComponent()
-    light.set_color([SUN] * 3)
-    light.disable_shadow()
-    entity.add_component(light)
-    entity.set_pose(_looking_along(np.array(SUN_DIRECTION)))
-    return entity
-
-
-def _looking_along(direction: NDArray[np.float64]) -> sapien.Pose:
-    """Pose at the origin, x along a direction that is not vertical, z as far up as can be."""
-    x = direction / np.linalg.norm(direction)
+def looking_at(place_m: Sequence[float], target_m: Sequence[float]) -> sapien.Pose:
+    """Pose at a place, x towards a target that is not straight above or below, z upwards."""
+    x = np.subtract(target_m, place_m)
+    x /= np.linalg.norm(x)
     y = np.cross([0.0, 0.0, 1.0], x)
     y /= np.linalg.norm(y)
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
+    matrix[:3, 3] = place_m
     return sapien.Pose(matrix)
 
 

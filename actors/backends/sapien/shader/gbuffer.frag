@@ -1,0 +1,43 @@
+#version 450
+// Matt surfaces under a bright sky and a sun behind the robot's left shoulder, without shadows.
+// SAPIEN's own shaders do far more; compiling them takes seconds, and this one draws twice as fast.
+
+layout(set = 2, binding = 0) uniform MaterialBuffer {
+  vec4 emission;
+  vec4 baseColor;
+  float fresnel;
+  float roughness;
+  float metallic;
+  float transmission;
+  float ior;
+  float transmissionRoughness;
+  int textureMask;
+  int padding;
+  vec4 textureTransforms[6];
+} material;
+
+struct PointLight { vec4 position; vec4 emission; };
+struct DirectionalLight { vec4 direction; vec4 emission; };
+struct SpotLight { vec4 position; vec4 direction; vec4 emission; };
+
+layout(set = 3, binding = 0) uniform SceneBuffer {
+  vec4 ambientLight;
+  PointLight pointLights[10];
+  DirectionalLight directionalLights[3];
+  SpotLight spotLights[10];
+  SpotLight texturedLights[1];
+} scene;
+
+layout(location = 0) in vec3 worldNormal;
+layout(location = 0) out vec4 outColor;
+
+const vec3 TO_SUN = vec3(-0.26, -0.43, 0.865);
+const float SUN = 0.4;
+const float SKY = 0.55;
+const float GROUND = 0.35;
+
+void main() {
+  vec3 normal = normalize(worldNormal);
+  float light = mix(GROUND, SKY, 0.5 + 0.5 * normal.z) + SUN * max(dot(normal, TO_SUN), 0.0);
+  outColor = vec4(pow(light * material.baseColor.rgb, vec3(1.0 / 2.2)), 1.0);
+}

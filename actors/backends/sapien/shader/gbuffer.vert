@@ -1,0 +1,33 @@
+#version 450
+// Places the vertices of one shape. SAPIEN finds the buffers by these declarations.
+
+layout(set = 0, binding = 0) uniform CameraBuffer {
+  mat4 viewMatrix;
+  mat4 projectionMatrix;
+  mat4 viewMatrixInverse;
+  mat4 projectionMatrixInverse;
+  float width;
+  float height;
+} camera;
+
+layout(set = 1, binding = 0) uniform ObjectTransformBuffer {
+  mat4 modelMatrix;
+} object;
+
+layout(set = 1, binding = 1) uniform ObjectDataBuffer {
+  uvec4 segmentation;
+  float transparency;
+  int shadeFlat;
+} objectData;
+
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+
+layout(location = 0) out vec3 worldNormal;
+
+void main() {
+  // Nothing is scaled unevenly, so normals turn like everything else.
+  worldNormal = mat3(object.modelMatrix) * normal;
+  gl_Position =
+      camera.projectionMatrix * camera.viewMatrix * object.modelMatrix * vec4(position, 1.0);
+}
