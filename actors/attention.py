@@ -24,7 +24,7 @@ def crop_of_focus(level: float) -> Crop:
 
 
 def clip_action(action: Array) -> Array:
-    """The action (11,) within the robot's limits."""
+    """Actions (..., 11) within the robot's limits."""
     return np.clip(action, _MINIMUM, _MAXIMUM)
 
 

@@ -306,8 +306,12 @@ class PostureFitter:
             leftmost = float((pose.points_m[:, 0] - self._arm.radii_m)[self._arm.of_hand].min())
             way = travel([self._start, posture, after[i]], np.linspace(0.05, 0.95, 19))
             on_the_way = [
-                self._obstacle(self._arm.pose(between), situation, PASSING_MARGIN_M)
+                part
                 for between in way
+                for part in (
+                    self._obstacle(self._arm.pose(between), situation, PASSING_MARGIN_M),
+                    self._limits(between),
+                )
             ]
             return np.concatenate(
                 [

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from actors.attention import clip_action
 from actors.tasks.experiment1 import (
     START,
     SUBTASKS,
@@ -49,7 +50,7 @@ def plan(situation: Situation) -> Array:
     closing = _ramp(total, steps["grasp"], CLOSING_STEPS)
     actions[:, GRASP] = 1.0 + 9.0 * closing
     actions[:, FOCUS] = 1.0 + 19.0 * _ramp(total, steps["descend"], FOCUS_STEPS)
-    return actions
+    return clip_action(actions)  # between key postures a joint may pass its limit by a degree
 
 
 @cache

@@ -1,0 +1,117 @@
+"""Whole episodes in real physics: what the tutor and the baselines can and cannot do."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from actors.player import play
+from actors.policies import make_policy, make_tutor
+from actors.simulator import make_simulator
+from actors.tasks.experiment1 import Experiment1
+from proto.config import Config, SimulatorConfig
+from proto.episode import Kind, Reason
+from proto.errors import UserError
+
+TASK = Experiment1()
+
+
+@pytest.fixture(scope="module")
+def physics():
+    simulator = make_simulator(SimulatorConfig(render=False))
+    yield simulator
+    simulator.close()
+
+
+def outcome(simulator, policy, situation, seed=0):
+    return play(
+        simulator, TASK, make_policy(policy, Config()), situation, seed=seed, kind=Kind.TRIAL
+    ).outcome
+
+
+@pytest.mark.parametrize("corner", range(8))
+def test_tutor_is_precise_at_every_corner_of_the_ranges(physics, corner):
+    result = outcome(physics, "tutor", TASK.corners()[corner])
+    assert result.precise, result
+
+
+def test_tutor_is_precise_inside_the_ranges(physics):
+    results = [outcome(physics, "tutor", TASK.sample(seed)) for seed in range(20)]
+    assert all(result.precise for result in results)
+
+
+def test_without_eyes_for_yaw_a_turned_object_is_shoved(physics):
+    for yaw in (-40.0, 40.0):
+        situation = {"obstacle_x_m": -0.27, "object_y_m": 0.25, "object_yaw_deg": yaw}
+        assert not outcome(physics, "yaw-blind", situation).strict
+        assert outcome(physics, "tutor", situation).strict
+
+
+@pytest.mark.parametrize("obstacle_x_m", [-0.32, -0.22])
+def test_without_eyes_for_the_obstacle_it_is_touched(physics, obstacle_x_m):
+    situation = {"obstacle_x_m": obstacle_x_m, "object_y_m": 0.25, "object_yaw_deg": 0.0}
+    assert outcome(physics, "obstacle-blind", situation).reason is Reason.TOUCHED_OBSTACLE
+
+
+def test_replay_only_works_where_it_was_recorded(physics):
+    recorded = {"obstacle_x_m": -0.27, "object_y_m": 0.25, "object_yaw_deg": 0.0}
+    assert outcome(physics, "replay", recorded).precise
+    assert not outcome(physics, "replay", {**recorded, "object_yaw_deg": 45.0}).strict
+
+
+def test_lookup_is_the_tutor_on_the_grid(physics):
+    case = TASK.tutored()[17]
+    assert outcome(physics, "lookup", case) == outcome(physics, "tutor", case)
+
+
+def test_lifting_needs_friction(monkeypatch):
+    class Slippery(Experiment1):
+        def scene(self, situation):
+            scene = super().scene(situation)
+            boxes = tuple(dataclasses.replace(box, friction=0.02) for box in scene.boxes)
+            return dataclasses.replace(scene, boxes=boxes)
+
+    monkeypatch.setattr("actors.backends.sapien.world.ROBOT_FRICTION", 0.02)
+    simulator = make_simulator(SimulatorConfig(render=False))
+    policy = make_tutor(Config(), noisy=False)
+    episode = play(simulator, Slippery(), policy, TASK.sample(1), seed=0, kind=Kind.TRIAL)
+    simulator.close()
+    assert not episode.outcome.lenient
+
+
+def test_the_same_episode_can_be_played_again_bit_by_bit(physics):
+    tutor = make_tutor(Config(), noisy=True)
+    play_it = lambda seed: play(  # noqa: E731
+        physics, TASK, tutor, TASK.tutored()[5], seed=seed, kind=Kind.TUTORING
+    )
+    first, other, again = play_it(3), play_it(4), play_it(3)
+    np.testing.assert_array_equal(first.body_poses, again.body_poses)
+    np.testing.assert_array_equal(first.joints_deg, again.joints_deg)
+    assert first.outcome == again.outcome
+    assert first.id != again.id
+    assert np.abs(first.joints_deg - other.joints_deg).max() > 0.1
+
+
+def test_noise_is_in_the_actions_and_the_clean_plan_stays_the_target(physics):
+    clean = play(
+        physics, TASK, make_tutor(Config(), noisy=False), TASK.tutored()[5],
+        seed=0, kind=Kind.TUTORING,
+    )  # fmt: skip
+    noisy = play(
+        physics, TASK, make_tutor(Config(), noisy=True), TASK.tutored()[5],
+        seed=1, kind=Kind.TUTORING,
+    )  # fmt: skip
+    np.testing.assert_array_equal(clean.actions, clean.targets)
+    np.testing.assert_array_equal(noisy.targets, clean.targets)
+    assert np.abs(noisy.actions - noisy.targets).max() > 0.5
+
+
+def test_an_unknown_policy_lists_the_ones_there_are():
+    with pytest.raises(UserError, match=r"tutor, replay, yaw-blind, obstacle-blind, lookup"):
+        make_policy("tutr", Config())
+
+
+def test_an_unknown_backend_lists_the_ones_there_are():
+    for name in ("sapiens", "no.such.module:Simulator", "actors.player:Nothing"):
+        with pytest.raises(UserError, match="sapien"):
+            make_simulator(SimulatorConfig(backend=name))
