@@ -187,6 +187,11 @@ class DoneConfig(_Section):
     policy_versions: Count | None = None
     trials: Count | None = None
 
+    @property
+    def ever(self) -> bool:
+        """Whether there is a condition."""
+        return self.policy_versions is not None or self.trials is not None
+
 
 class Config(_Section):
     """Everything a run depends on."""

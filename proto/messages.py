@@ -7,7 +7,7 @@ from enum import StrEnum
 from typing import Annotated, Final
 
 from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
-from proto.codec import MEBIBYTE, Array, Blob, Integer, Maybe, Number, Text, message
+from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Text, message
 from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind
 from proto.keys import Role
 
@@ -50,17 +50,15 @@ class Sequence:
 @message("rollout", 1, limit=EPISODE_LIMIT)
 @dataclass(frozen=True)
 class Rollout:
-    """An episode that a network played, for the evaluator.
+    """An episode that a network played, as a trial or for practice, for the evaluator.
 
     Attributes:
         episode: the whole of it.
         run_id: training that the policy comes from.
-        trial: index of the trial that was asked for, or None for practice.
     """
 
     episode: Episode
     run_id: Id
-    trial: Annotated[int | None, Maybe(Integer(0, 2**31))]
 
 
 @message("receipt", 1)
@@ -114,11 +112,9 @@ class Trial:
     """A trial to play with the policy version of the request.
 
     Attributes:
-        index: which trial of this policy version it is.
         seed: seed of the situation and of the episode.
     """
 
-    index: Count
     seed: Annotated[int, Integer(0, 2**63 - 1)]
 
 

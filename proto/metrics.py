@@ -138,7 +138,7 @@ class PolicyScore:
         lenient: lifted at the end, the paper's reading.
         strict: lifted and held, obstacle untouched, object not shoved.
         precise: strict, and the hand was placed right.
-        reasons: how many trials ended for each reason.
+        reasons: how many trials fell short of `precise`, by reason.
     """
 
     version: Count

@@ -13,7 +13,7 @@ from typing import Final
 
 from proto.bus import Inbox, open_bus
 from proto.config import Config
-from proto.episode import Episode
+from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.keys import Role
 from proto.messages import Rollout
@@ -51,7 +51,7 @@ class Recorder:
         with self._bus, membership(self._bus, self, lifecycle):
             while not lifecycle.stopping or len(self._inbox):
                 rollout = self._inbox.take(timeout_s=0.5)
-                if rollout is not None and (self._practice or rollout.trial is not None):
+                if rollout is not None and (self._practice or rollout.episode.kind is Kind.TRIAL):
                     self._record(rollout.episode)
 
     def metrics(self) -> RecorderMetrics:

@@ -85,7 +85,7 @@ def rollout(make_episode: MakeEpisode) -> Callable[..., Rollout]:
             kind=Kind.PRACTICE if trial is None else Kind.TRIAL,
             outputs=np.full((20, 110), 0.1, dtype=np.float32),
         )
-        return Rollout(episode=episode, run_id="training", trial=trial)
+        return Rollout(episode=episode, run_id="training")
 
     return make
 

@@ -1,0 +1,242 @@
+"""The actor on the bus: plays what is asked for with the newest policy, and loses nothing."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from actors.player import LiveStep, play
+from actors.policies import make_tutor
+from actors.policy import Policy
+from actors.simulator import make_simulator
+from actors.tasks.registry import make_task
+from actors.tasks.task import Situation
+from learner.policy import NetworkPolicy
+from proto.bus import Bus
+from proto.codec import MessageError, encode
+from proto.config import Config
+from proto.episode import Episode, Kind
+from proto.errors import UserError
+from proto.messages import (
+    Live,
+    PolicyVersion,
+    Receipt,
+    Rollout,
+    Sequence,
+    Trial,
+    TrialRequest,
+    TutoringCase,
+    TutoringRequest,
+)
+from proto.metrics import ActorMetrics
+from proto.outbox import Outbox
+from proto.pace import Pace
+from proto.process import Lifecycle, every, membership
+
+LOG = logging.getLogger(__name__)
+
+IDLE_S: Final = 0.3
+OUTBOX_PERIOD_S: Final = 1.0
+OUTBOX_LIMIT: Final = 100
+"""With so many episodes without a receipt it waits instead of playing on."""
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """An episode to play.
+
+    Attributes:
+        kind: why.
+        policy: who acts.
+        situation: in which situation.
+        seed: seed of the episode.
+    """
+
+    kind: Kind
+    policy: Policy
+    situation: Situation
+    seed: int
+
+
+class _StoppedError(Exception):
+    """The episode is given up because the actor should stop."""
+
+
+class ActorProcess:
+    """Takes newer policies between episodes only: a recurrent state never crosses a change."""
+
+    def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
+        """Make the simulator and find what a former process with this id left to be sent.
+
+        Raises:
+            UserError: the simulator cannot run on this machine.
+        """
+        self._config = config
+        self._bus = bus
+        self._lifecycle = lifecycle
+        self._digest = config.digest()
+        self._task = make_task(config.task)
+        self._tutored = self._task.tutored()
+        self._simulator = make_simulator(config.simulator)
+        self._outbox = Outbox(config.run_folder / "outbox" / bus.id, bus.deliver_wire)
+        self._policy: NetworkPolicy | None = None
+        self._policy_run = ""
+        self._offered: PolicyVersion | None = None
+        self._offering = threading.Lock()
+        self._pace = Pace()
+        self._episodes = 0
+        self._last: Episode | None = None
+
+    def run(self) -> None:
+        """Play until it should stop; an episode that is going on then is given up."""
+        keys = self._bus.keys
+        self._bus.subscribe(keys.receipt(self._bus.id), self._on_receipt, Receipt)
+        self._bus.subscribe_newest(keys.policy, self._on_policy, PolicyVersion)
+        try:
+            with (
+                membership(self._bus, self, self._lifecycle),
+                every(OUTBOX_PERIOD_S, self._outbox.send_due),
+            ):
+                while not self._lifecycle.stopping:
+                    self._play_next()
+        finally:
+            self._simulator.close()
+
+    def metrics(self) -> ActorMetrics:
+        """What it tells about itself."""
+        last = self._last
+        return ActorMetrics(
+            id=self._bus.id,
+            time_s=time.time(),
+            refused=self._bus.refused,
+            policy_version=self._policy.version if self._policy else 0,
+            steps_per_s=self._pace.per_second(),
+            episodes=self._episodes,
+            last_outcome=last.outcome.reason if last else None,
+            last_kind=last.kind if last else None,
+            backend=self._simulator.name,
+            outbox=len(self._outbox),
+            paused=self._lifecycle.paused,
+        )
+
+    def checkpoint(self) -> str:
+        """Nothing is to be saved: finished episodes are on disk until their receipts come."""
+        return f"{len(self._outbox)} episodes wait for their receipts on disk"
+
+    def _play_next(self) -> None:
+        assignment = None
+        if not self._lifecycle.paused and len(self._outbox) < OUTBOX_LIMIT:
+            self._take_newest_policy()
+            assignment = self._tutoring() or self._trial() or self._practice()
+        if assignment is None:
+            self._lifecycle.wait(IDLE_S)
+            return
+        try:
+            episode = self._play(assignment)
+        except _StoppedError:
+            return
+        self._episodes += 1
+        self._last = episode
+        self._send(episode)
+
+    def _tutoring(self) -> Assignment | None:
+        """A case that the learner wants to be shown."""
+        request = TutoringRequest(self._bus.id)
+        for answer in self._bus.ask(self._bus.keys.request_tutoring, request, TutoringCase):
+            if answer.case >= len(self._tutored):
+                LOG.warning("the learner asks for case %d, which there is not", answer.case)
+                continue
+            policy = make_tutor(self._config, noisy=answer.repeat > 0)
+            return Assignment(Kind.TUTORING, policy, self._tutored[answer.case], answer.seed)
+        return None
+
+    def _trial(self) -> Assignment | None:
+        """A trial of the policy at hand that the evaluator wants."""
+        if self._policy is None:
+            return None
+        request = TrialRequest(self._bus.id, self._policy_run, self._policy.version)
+        for trial in self._bus.ask(self._bus.keys.request_trial, request, Trial):
+            situation = self._task.sample(trial.seed)
+            return Assignment(Kind.TRIAL, self._policy, situation, trial.seed)
+        return None
+
+    def _practice(self) -> Assignment | None:
+        """A situation of its own choice."""
+        if self._policy is None or not self._config.actor.practice:
+            return None
+        seed = secrets.randbits(31)
+        return Assignment(Kind.PRACTICE, self._policy, self._task.sample(seed), seed)
+
+    def _play(self, assignment: Assignment) -> Episode:
+        def on_step(live: LiveStep) -> None:
+            if self._lifecycle.stopping:
+                raise _StoppedError
+            self._pace.add()
+            if self._config.actor.live:
+                self._publish_live(assignment, live)
+
+        return play(
+            self._simulator,
+            self._task,
+            assignment.policy,
+            assignment.situation,
+            seed=assignment.seed,
+            kind=assignment.kind,
+            actor=self._bus.id,
+            config_digest=self._digest,
+            on_step=on_step,
+        )
+
+    def _publish_live(self, assignment: Assignment, live: LiveStep) -> None:
+        message = Live(
+            actor=self._bus.id,
+            kind=assignment.kind,
+            policy=assignment.policy.name,
+            policy_version=assignment.policy.version,
+            step=live.step,
+            phase=live.phase,
+            image=live.image,
+            joints_deg=live.joints_deg.astype(np.float32),
+            action=live.action.astype(np.float32),
+        )
+        self._bus.publish(self._bus.keys.live(self._bus.id), message)
+
+    def _send(self, episode: Episode) -> None:
+        tutoring = episode.kind is Kind.TUTORING
+        keys = self._bus.keys
+        key = keys.sequence(self._bus.id) if tutoring else keys.rollout(self._bus.id)
+        try:
+            wire = encode(Sequence(episode) if tutoring else Rollout(episode, self._policy_run))
+        except MessageError as error:  # such as a simulation that blew up into NaN
+            LOG.warning("episode %s is dropped, nobody would take it: %s", episode.id, error)
+            return
+        self._outbox.add(episode.id, key, wire)
+
+    def _on_receipt(self, receipt: Receipt) -> None:
+        self._outbox.received(receipt.episode)
+
+    def _on_policy(self, offered: PolicyVersion) -> None:
+        with self._offering:
+            self._offered = offered
+
+    def _take_newest_policy(self) -> None:
+        with self._offering:
+            offered, self._offered = self._offered, None
+        if offered is None:
+            return
+        held = self._policy.version if self._policy and offered.run_id == self._policy_run else 0
+        if offered.version <= held:
+            return
+        try:
+            self._policy = NetworkPolicy.from_bytes(offered.weights)
+        except UserError as error:
+            LOG.warning("policy %d is not taken: %s", offered.version, error)
+            return
+        self._policy_run = offered.run_id
+        LOG.info("acts with policy %d from now on", self._policy.version)

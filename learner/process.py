@@ -1,0 +1,186 @@
+"""The learner on the bus: asks for sequences, keeps them, trains, publishes policies."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from pathlib import Path
+from typing import Final
+
+from learner.checkpoint import load_checkpoint, policy_file, training_file
+from learner.curriculum import Curriculum
+from learner.offline import open_training, policy_is_due, write_policy
+from learner.store import TutoringStore
+from proto.bus import Bus, Inbox
+from proto.config import Config
+from proto.files import written_whole
+from proto.keys import Role
+from proto.messages import PolicyVersion, Receipt, Sequence, TutoringCase, TutoringRequest
+from proto.metrics import LearnerMetrics, Stage
+from proto.pace import Pace
+from proto.process import Lifecycle, alone_in_run, membership
+
+LOG = logging.getLogger(__name__)
+
+WAITING: Final = 64
+"""Sequences that may wait to be kept; more are dropped, and sent again by their actors."""
+IDLE_S: Final = 0.2
+_TRAINING: Final = (Stage.PRETRAINING, Stage.COUPLED)
+
+
+class LearnerProcess:
+    """Restores first, publishes second: what it published before a restart it still knows.
+
+    Sequences come in, and cases are handed out, while it trains.
+    """
+
+    def __init__(
+        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, tutored_cases: int
+    ) -> None:
+        """Restore what is in the run's folder.
+
+        Args:
+            config: the configuration of the run.
+            bus: connection to the others.
+            lifecycle: when to pause and to stop.
+            tutored_cases: number of tutored cases that the task has.
+
+        Raises:
+            UserError: the folder holds a training that cannot go on, or the configuration asks for
+                a case that there is not.
+        """
+        self._config = config
+        self._bus = bus
+        self._lifecycle = lifecycle
+        self._folder = config.run_folder
+        self._curriculum = Curriculum(config, tutored_cases)
+        self._store = TutoringStore(self._folder / "tutoring")
+        self._curriculum.shown(filter(None, map(self._store.load, self._store.ids)))
+        self._start_with = min(config.learner.start_sequences, self._curriculum.size)
+        self._trainer = open_training(config, self._folder, self._store, None)
+        self._training = threading.Lock()  # held while the trainer changes or is written to disk
+        self._run_id = _run_id(self._folder)
+        self._pace = Pace()
+
+    def run(self) -> None:
+        """Learn until it should stop, then save.
+
+        Raises:
+            UserError: the run has a learner already, the training diverged, or the disk is full.
+        """
+        alone_in_run(self._bus, self._lifecycle)
+        self._config.save(self._folder / "config.yaml")
+        self._publish()
+        inbox = self._open_doors()
+        with membership(self._bus, self, self._lifecycle):
+            while not self._lifecycle.stopping:
+                may_train = self._may_train
+                self._receive(inbox, wait_s=0.0 if may_train else IDLE_S)
+                if may_train:
+                    self._train()
+        LOG.info(self.checkpoint())
+
+    def metrics(self) -> LearnerMetrics:
+        """What it tells about itself."""
+        done = self._config.done
+        return LearnerMetrics(
+            id=self._bus.id,
+            time_s=time.time(),
+            refused=self._bus.refused,
+            stage=self._stage,
+            epoch=self._trainer.epochs_done,
+            epochs_total=self._trainer.epochs_total,
+            loss=self._trainer.loss,
+            sequences=len(self._store),
+            epochs_per_s=self._pace.per_second(),
+            policy_version=self._trainer.version,
+            paused=self._lifecycle.paused,
+            done=done.ever and self._trainer.version >= (done.policy_versions or 0),
+        )
+
+    def checkpoint(self) -> str:
+        """Save the training, after the epoch that is going on."""
+        path = training_file(self._folder)
+        with self._training:
+            self._trainer.save(path)
+            return f"saved {self._trainer.stage} epoch {self._trainer.epochs_done} to {path}"
+
+    @property
+    def _stage(self) -> Stage:
+        waiting = len(self._store) < self._start_with and not self._trainer.finished
+        return Stage.WAITING if waiting else self._trainer.stage
+
+    @property
+    def _may_train(self) -> bool:
+        return self._stage in _TRAINING and not self._lifecycle.paused
+
+    def _open_doors(self) -> Inbox[Sequence]:
+        """From now on sequences are received and cases handed out."""
+        keys = self._bus.keys
+        self._bus.answer(keys.request_tutoring, TutoringRequest, self._hand_out)
+        self._bus.watch_presence(Role.ACTOR, self._on_presence)
+        return self._bus.inbox(keys.sequence(), Sequence, capacity=WAITING)
+
+    def _hand_out(self, request: TutoringRequest) -> TutoringCase | None:
+        return None if self._lifecycle.paused else self._curriculum.next_case(request.actor)
+
+    def _on_presence(self, actor: str, alive: bool) -> None:
+        if not alive:
+            self._curriculum.release(actor)
+
+    def _receive(self, inbox: Inbox[Sequence], wait_s: float) -> None:
+        while (sequence := inbox.take(timeout_s=wait_s)) is not None:
+            episode = sequence.episode
+            if self._curriculum.wants(episode):
+                self._store.add(episode)
+                self._curriculum.shown([episode])
+                LOG.info("sequence %d of %d", len(self._store), self._curriculum.size)
+            # One that is not wanted, such as the second of a case, need not be sent again either.
+            self._bus.deliver(self._bus.keys.receipt(episode.actor), Receipt(episode.id))
+            wait_s = 0.0
+
+    def _train(self) -> None:
+        with self._training:
+            self._trainer.epoch()
+        self._pace.add()
+        if policy_is_due(self._trainer, self._config.learner):
+            with self._training:
+                write_policy(self._trainer, self._folder)
+            # the training on disk knows of a version before anyone else does
+            LOG.info(self.checkpoint())
+            self._publish()
+        elif self._trainer.epochs_done % self._config.learner.checkpoint_every_epochs == 0:
+            LOG.info(self.checkpoint())
+
+    def _publish(self) -> None:
+        """Publish the newest policy there is, if there is one."""
+        version = self._trainer.version
+        if version == 0:
+            return
+        path = policy_file(self._folder, version)
+        metadata = load_checkpoint(path).metadata
+        self._bus.publish_newest(
+            self._bus.keys.policy,
+            PolicyVersion(
+                run_id=self._run_id,
+                version=version,
+                epoch=metadata.epoch,
+                loss=metadata.loss or 0.0,
+                config_digest=metadata.config_digest,
+                weights=path.read_bytes(),
+            ),
+        )
+        LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
+
+
+def _run_id(folder: Path) -> str:
+    """Id of the training in a folder; a training that starts anew gets a new one."""
+    path = training_file(folder).with_name("run_id")
+    if training_file(folder).exists() and path.exists():
+        return path.read_text()
+    run_id = secrets.token_hex(8)
+    with written_whole(path) as stream:
+        stream.write(run_id.encode())
+    return run_id

@@ -1,0 +1,28 @@
+"""How fast something goes."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+
+class Pace:
+    """Counts in one thread, tells in another."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._count = 0
+        self._since_s = time.monotonic()
+
+    def add(self, count: int = 1) -> None:
+        """So many more were done."""
+        with self._lock:
+            self._count += count
+
+    def per_second(self) -> float:
+        """How many a second were done since the last time this was asked."""
+        with self._lock:
+            now = time.monotonic()
+            pace = self._count / max(now - self._since_s, 1e-6)
+            self._count, self._since_s = 0, now
+            return pace

@@ -1,0 +1,30 @@
+"""`vmdnn actor`."""
+
+from __future__ import annotations
+
+import argparse
+
+from actors.process import ActorProcess
+from proto.bus import open_bus
+from proto.keys import Role
+from proto.process import Lifecycle, own_id
+from services.commands.options import add_process, config_of, start_logging
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    add_process(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Play until told to stop."""
+    start_logging("actor")
+    config = config_of(arguments)
+    lifecycle = Lifecycle()
+    lifecycle.stop_on_signals()
+    with (
+        own_id(config.run_folder, Role.ACTOR, arguments.id) as process,
+        open_bus(config.hub, config.run.name, Role.ACTOR, process) as bus,
+    ):
+        ActorProcess(config, bus, lifecycle).run()
+    return 0

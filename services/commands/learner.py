@@ -1,0 +1,33 @@
+"""`vmdnn learner`."""
+
+from __future__ import annotations
+
+import argparse
+
+from actors.tasks.registry import make_task
+from learner.process import LearnerProcess
+from proto.bus import open_bus
+from proto.keys import Role
+from proto.process import Lifecycle, only_one
+from services.commands.options import add_process, config_of, start_logging
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    add_process(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Learn until told to stop."""
+    start_logging("learner")
+    config = config_of(arguments)
+    lifecycle = Lifecycle()
+    lifecycle.stop_on_signals()
+    cases = len(make_task(config.task).tutored())
+    process = arguments.id or "learner"
+    with (
+        only_one(config.run_folder, Role.LEARNER, "learner"),
+        open_bus(config.hub, config.run.name, Role.LEARNER, process) as bus,
+    ):
+        LearnerProcess(config, bus, lifecycle, tutored_cases=cases).run()
+    return 0
