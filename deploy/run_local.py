@@ -15,7 +15,7 @@ from rich.console import Console
 
 from deploy.supervision import BAD_INPUT, ProcessState, Program, Supervisor
 from proto.bus import Bus, open_bus
-from proto.config import Config, DoneConfig, load_config
+from proto.config import Config, load_config
 from proto.errors import UserError
 from proto.keys import Role
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
@@ -91,9 +91,10 @@ def run(config: Config, actors: int, console: Console) -> None:
         with _connect(config, supervisor, lifecycle) as bus:
             for program in supervisor.programs[1:]:
                 supervisor.start(program.name)
-            view = _follow(Board(bus), supervisor, config, lifecycle, console)
+            view = _follow(Board(bus), supervisor, lifecycle, console)
         console.print("stopping", highlight=False)
-    console.print(summary(view, config, time.monotonic() - started_s), highlight=False)
+    text = summary(view, config, time.monotonic() - started_s)
+    console.print(text, highlight=False, soft_wrap=True)
 
 
 def programs(config: Config, file: Path, actors: int) -> list[Program]:
@@ -118,14 +119,13 @@ def programs(config: Config, file: Path, actors: int) -> list[Program]:
     return started
 
 
-def is_done(view: View, done: DoneConfig) -> bool:
-    """Whether learner and evaluator both say that they have reached what `done` asks for."""
-    if done == DoneConfig():
-        return False
+def is_done(view: View) -> bool:
+    """Whether learner and evaluator say that they have reached what the config's `done` asks."""
     learners = view.living(LearnerMetrics)
     evaluators = view.living(EvaluatorMetrics)
-    done_so_far = [*(m.done for m in learners), *(m.done for m in evaluators)]
-    return bool(learners) and bool(evaluators) and all(done_so_far)
+    if not learners or not evaluators:
+        return False
+    return all(m.done for m in learners) and all(m.done for m in evaluators)
 
 
 class Crashes:
@@ -172,9 +172,7 @@ def summary(view: View, config: Config, wall_s: float) -> str:
     return "\n".join(lines)
 
 
-def _follow(
-    board: Board, supervisor: Supervisor, config: Config, lifecycle: Lifecycle, console: Console
-) -> View:
+def _follow(board: Board, supervisor: Supervisor, lifecycle: Lifecycle, console: Console) -> View:
     """Show what happens until the run is done or should stop; the last view."""
     crashes = Crashes()
     with display(console) as show:
@@ -183,7 +181,7 @@ def _follow(
             show(view)
             for process in crashes.look(supervisor.processes()):
                 console.print(f"{process.name} crashed and is back; see {process.log}")
-            if lifecycle.stopping or is_done(view, config.done):
+            if lifecycle.stopping or is_done(view):
                 return view
             lifecycle.wait(METRICS_PERIOD_S)
 

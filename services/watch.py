@@ -30,7 +30,7 @@ from proto.metrics import (
     Success,
 )
 
-LINES_PERIOD_S: Final = 10.0
+LINES_PERIOD_S: Final = 5.0
 """How often a line is written where there is no terminal."""
 ROWS_SHOWN: Final = 12
 
@@ -148,7 +148,7 @@ def _tables(console: Console) -> Iterator[Show]:
 
 @contextmanager
 def _lines(console: Console) -> Iterator[Show]:
-    due_s = 0.0
+    due_s = time.monotonic() + LINES_PERIOD_S
     last = ""
 
     def show(view: View) -> None:
