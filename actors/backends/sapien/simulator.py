@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from actors.backends.sapien.graphics import require_graphics
 from actors.backends.sapien.stage import Colours, Stage, looking_at
 from actors.backends.sapien.world import RobotBuilder, World
 from actors.simulator import (
@@ -43,12 +44,17 @@ class SapienSimulator:
     """Plays scenes in SAPIEN; see `actors.simulator.Simulator`.
 
     With `config.render` false nothing graphical is touched and every observed image is black.
+
+    Raises:
+        UserError: pictures are wanted, but this machine cannot render; the message says what to do.
     """
 
     name = "sapien"
 
     def __init__(self, config: SimulatorConfig) -> None:
         self.control_period_s = config.control_period_s
+        if config.render:
+            require_graphics()
         self._config = config
         self._model = build_icub()
         self._builder = RobotBuilder(self._model)
