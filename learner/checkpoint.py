@@ -181,9 +181,9 @@ def check_same_network(wanted: NetworkConfig, checkpoint: Checkpoint, origin: st
     Raises:
         UserError: the networks differ; the message names each field and both values.
     """
-    here, there = wanted.model_dump(), checkpoint.metadata.network.model_dump()
+    here, there = _fields(wanted), _fields(checkpoint.metadata.network)
     differences = [
-        f"  network.{name}: {there[name]} in the checkpoint, {here[name]} in the config"
+        f"  {name}: {there[name]} in the checkpoint, {here[name]} in the config"
         for name in here
         if here[name] != there[name]
     ]
@@ -193,6 +193,17 @@ def check_same_network(wanted: NetworkConfig, checkpoint: Checkpoint, origin: st
             + "\n".join(differences)
             + "\nUse the config that it was trained with, or start a run of another name."
         )
+
+
+def _fields(network: NetworkConfig) -> dict[str, object]:
+    """All values by their full name, such as `network.pfc.tau`."""
+    fields: dict[str, object] = {}
+    for name, value in network:
+        if isinstance(value, BaseModel):
+            fields |= {f"network.{name}.{inner}": held for inner, held in value}
+        else:
+            fields[f"network.{name}"] = value
+    return fields
 
 
 def _check_tensors(checkpoint: Checkpoint, origin: str) -> None:
@@ -214,3 +225,13 @@ def _check_tensors(checkpoint: Checkpoint, origin: str) -> None:
     code = checkpoint.metadata.code
     if code is not None and not len(code.minima) == len(code.maxima) == ACTION_SIZE:
         raise UserError(f"{origin}: its code is not for {ACTION_SIZE} action values")
+
+
+def training_file(run_folder: Path) -> Path:
+    """Where a run keeps its newest training checkpoint."""
+    return run_folder / "checkpoints" / "training.safetensors"
+
+
+def policy_file(run_folder: Path, version: int) -> Path:
+    """Where a run keeps a policy version."""
+    return run_folder / "policies" / f"{version:06d}.safetensors"

@@ -1,0 +1,151 @@
+"""`vmdnn train`: train a network on recorded sequences."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from learner.checkpoint import policy_file, training_file
+from learner.offline import open_training, run_training
+from learner.store import TutoringStore
+from learner.training import Trainer
+from proto.action import ARM, FOCUS, GRASP, NECK
+from proto.errors import UserError
+from services.commands.options import add_config, config_of
+
+_INTERRUPTED: Final = 130
+_LINE_PERIOD_S: Final = 5.0
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the subcommand's arguments."""
+    add_config(parser)
+    parser.add_argument("--data", type=Path, required=True, help="folder of tutored sequences")
+    parser.add_argument(
+        "--pretraining-data", type=Path, help="folder of sequences for pre-training, if others"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of the run; goes on with the one in it"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train until done or Ctrl-C; either way the run's folder holds all that was learned."""
+    config = config_of(arguments)
+    store = _filled_store(arguments.data)
+    others = arguments.pretraining_data
+    folder: Path = arguments.out
+    trainer = open_training(config, folder, store, _filled_store(others) if others else None)
+    config.save(folder / "config.yaml")
+    if trainer.finished:
+        print(f"{folder} is trained already; learner.epochs above {trainer.epochs_done} goes on")
+        return 0
+    with _interruption() as interrupted, _progress(trainer) as show:
+
+        def go_on(loss: float) -> bool:
+            show(loss)
+            return not interrupted()
+
+        run_training(trainer, config.learner, folder, go_on)
+    if not trainer.finished:
+        print(f"stopped; the same command goes on from {training_file(folder)}")
+        return _INTERRUPTED
+    _print_summary(trainer, folder)
+    return 0
+
+
+def _filled_store(folder: Path) -> TutoringStore:
+    if not folder.is_dir():
+        raise UserError(f"--data {folder} is no folder; record one with `vmdnn tutor --out DIR`")
+    store = TutoringStore(folder)
+    if not store.ids:
+        raise UserError(
+            f"--data {folder} holds no sequence (*.mcap); record some with `vmdnn tutor --out DIR`"
+        )
+    return store
+
+
+@contextmanager
+def _interruption() -> Iterator[Callable[[], bool]]:
+    """Tell whether Ctrl-C was pressed, so that an epoch can end; a second one ends at once."""
+    pressed = False
+
+    def note(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal pressed
+        pressed = True
+        signal.signal(signal.SIGINT, before)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _progress(trainer: Trainer) -> Iterator[Callable[[float], None]]:
+    """Show each epoch: a bar on a terminal, a line now and then elsewhere."""
+    console = Console()
+    if not console.is_terminal:
+        yield _line_printer(trainer)
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("loss {task.fields[loss]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        bar = progress.add_task("", loss="-")
+
+        def show(loss: float) -> None:
+            progress.update(
+                bar,
+                description=f"{trainer.stage} on {trainer.sequences} sequences",
+                completed=trainer.epochs_done,
+                total=trainer.epochs_total,
+                loss=f"{loss:.5f}",
+            )
+
+        yield show
+
+
+def _line_printer(trainer: Trainer) -> Callable[[float], None]:
+    last = time.monotonic()
+    epochs = 0
+
+    def show(loss: float) -> None:
+        nonlocal last, epochs
+        epochs += 1
+        elapsed = time.monotonic() - last
+        stage_over = trainer.epochs_done in {0, trainer.epochs_total}
+        if elapsed < _LINE_PERIOD_S and not stage_over:
+            return
+        print(
+            f"{trainer.stage} epoch {trainer.epochs_done}/{trainer.epochs_total}"
+            f" loss {loss:.5f} sequences {trainer.sequences} {elapsed / epochs:.3f} s/epoch",
+            flush=True,
+        )
+        last, epochs = time.monotonic(), 0
+
+    return show
+
+
+def _print_summary(trainer: Trainer, folder: Path) -> None:
+    errors = trainer.mean_errors()
+    print(
+        f"trained on {trainer.sequences} sequences: loss {trainer.loss:.5f}; mean error with the"
+        f" tutor's pictures: neck {errors[NECK].mean():.2f} deg, arm {errors[ARM].mean():.2f} deg,"
+        f" grasp level {errors[GRASP]:.2f}, focus level {errors[FOCUS]:.2f}"
+    )
+    print(f"policy {trainer.version}: {policy_file(folder, trainer.version)}")

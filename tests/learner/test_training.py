@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from learner.policy import NetworkPolicy
+from learner.store import TutoringStore
+from learner.training import Trainer
+from proto.action import ARM
+from proto.config import Config
+from proto.episode import Episode, Kind
+from proto.errors import UserError
+from proto.metrics import Stage
+
+MakeConfig = Callable[..., Config]
+MakeEpisodes = Callable[..., Sequence[Episode]]
+
+
+@pytest.fixture
+def store(tmp_path: Path, bar_episodes: MakeEpisodes) -> TutoringStore:
+    store = TutoringStore(tmp_path / "tutoring")
+    for episode in bar_episodes():
+        store.add(episode)
+    return store
+
+
+def train(trainer: Trainer, epochs: int) -> list[float]:
+    return [trainer.epoch() for _ in range(epochs)]
+
+
+def same_network(one: Trainer, other: Trainer) -> bool:
+    there = other.network.state_dict()
+    return all(
+        torch.equal(tensor, there[name]) for name, tensor in one.network.state_dict().items()
+    )
+
+
+def test_it_learns_to_tell_situations_apart(
+    store: TutoringStore, small_config: MakeConfig, bar_episodes: MakeEpisodes
+) -> None:
+    trainer = Trainer(small_config(pretraining=60, epochs=300, batch=60), store)
+    while trainer.stage is Stage.PRETRAINING:
+        trainer.epoch()
+    first, *_, last = train(trainer, 300)
+    assert last < 0.15 * first
+    assert trainer.mean_errors()[ARM].mean() < 4
+
+    policy = NetworkPolicy.from_bytes(trainer.policy_bytes(1))
+    for episode in bar_episodes():
+        policy.begin({}, 0)
+        for image in episode.images:
+            action = policy.step(image)
+        # at the end situations lie 25 to 90 degrees apart
+        assert np.abs(action - episode.targets[-1])[ARM].max() < 15
+
+
+def test_stages_follow_each_other(store: TutoringStore, small_config: MakeConfig) -> None:
+    trainer = Trainer(small_config(pretraining=2, epochs=3), store)
+    seen = []
+    while not trainer.finished:
+        seen.append((trainer.stage, trainer.epochs_done, trainer.epochs_total))
+        trainer.epoch()
+    assert seen == [
+        (Stage.PRETRAINING, 0, 2),
+        (Stage.PRETRAINING, 1, 2),
+        (Stage.COUPLED, 0, 3),
+        (Stage.COUPLED, 1, 3),
+        (Stage.COUPLED, 2, 3),
+    ]
+    assert trainer.stage is Stage.FINISHED
+
+
+def test_coupled_training_leaves_the_vision_alone(
+    store: TutoringStore, small_config: MakeConfig
+) -> None:
+    trainer = Trainer(small_config(pretraining=1, epochs=3), store)
+    at_first = {n: p.clone() for n, p in trainer.network.named_parameters()}
+    trainer.epoch()
+    formed = {n: p.clone() for n, p in trainer.network.named_parameters()}
+    train(trainer, 3)
+    for name, parameter in trainer.network.named_parameters():
+        vision = name.startswith("mstnn")
+        assert torch.equal(parameter, formed[name]) == vision, name
+        assert torch.equal(at_first[name], formed[name]) != (vision or name.startswith("pfc.")) or (
+            name == "pfc.feedback"
+        ), name
+
+
+def test_same_seed_same_network(store: TutoringStore, small_config: MakeConfig) -> None:
+    config = small_config()
+    other_seed = config.model_copy(update={"run": config.run.model_copy(update={"seed": 2})})
+    trainers = [Trainer(given, store) for given in (config, config, other_seed)]
+    for trainer in trainers:
+        train(trainer, 10)
+    assert same_network(trainers[0], trainers[1])
+    assert not same_network(trainers[0], trainers[2])
+
+
+@pytest.mark.parametrize("interruptions", [[0], [2], [4], [5], [1, 3, 6, 9], [10]])
+def test_resumed_training_is_bit_identical(
+    store: TutoringStore, small_config: MakeConfig, tmp_path: Path, interruptions: list[int]
+) -> None:
+    config = small_config(pretraining=4, epochs=6)
+    whole = Trainer(config, store)
+    losses = train(whole, 10)
+
+    path = tmp_path / "training.safetensors"
+    trainer, resumed = Trainer(config, store), []
+    for end in [*interruptions, 10]:
+        resumed += train(trainer, end - len(resumed))
+        trainer.save(path)
+        trainer = Trainer.restore(path, config, TutoringStore(store.folder))
+    assert resumed == losses
+    assert trainer.finished
+    assert same_network(trainer, whole)
+    assert trainer.policy_bytes(1) == whole.policy_bytes(1)
+
+
+def test_sequences_may_come_while_training_goes_on(
+    tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes
+) -> None:
+    config = small_config(pretraining=3, epochs=6)
+    episodes = bar_episodes()
+    store = TutoringStore(tmp_path / "tutoring")
+    trainer = Trainer(config, store)
+    with pytest.raises(UserError, match=r"holds no tutored sequence .*`vmdnn tutor`"):
+        trainer.epoch()
+    counts = []
+    for episode in (episodes[3], episodes[0], None, None, episodes[2], None):
+        if episode is not None:
+            store.add(episode)
+        trainer.epoch()
+        counts.append((trainer.stage, trainer.sequences))
+    assert counts == [
+        (Stage.PRETRAINING, 1),
+        (Stage.PRETRAINING, 2),
+        (Stage.COUPLED, 0),
+        (Stage.COUPLED, 2),
+        (Stage.COUPLED, 3),
+        (Stage.COUPLED, 3),
+    ]
+    # the order in which they came counts, and survives
+    path = tmp_path / "training.safetensors"
+    trainer.save(path)
+    resumed = Trainer.restore(path, config, TutoringStore(store.folder))
+    assert train(resumed, 3) == train(trainer, 3)
+    assert same_network(resumed, trainer)
+
+
+def test_ranges_of_the_code_stay_as_they_were_when_coupled_training_began(
+    tmp_path: Path,
+    small_config: MakeConfig,
+    bar_episodes: MakeEpisodes,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    store = TutoringStore(tmp_path / "tutoring")
+    near, far = bar_episodes(places=(0.5, 1.0), slopes=(0.5,))
+    store.add(near)
+    trainer = Trainer(small_config(pretraining=0), store)
+    trainer.epoch()
+    before = trainer.policy_bytes(1)
+    store.add(far)
+    trainer.epoch()
+    assert f"sequence {far.id}: neck_yaw goes" in caplog.text
+    code = NetworkPolicy.from_bytes(before)._code
+    np.testing.assert_array_equal(
+        NetworkPolicy.from_bytes(trainer.policy_bytes(2))._code.maxima, code.maxima
+    )
+
+
+def test_pretraining_may_have_sequences_of_its_own(
+    store: TutoringStore, tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes
+) -> None:
+    others = TutoringStore(tmp_path / "others")
+    for episode in bar_episodes(places=(0.0, 0.5, 1.0), steps=12):
+        others.add(episode)
+    trainer = Trainer(small_config(pretraining=2), store, others)
+    trainer.epoch()
+    assert trainer.sequences == 6
+    train(trainer, 2)
+    assert trainer.sequences == 4
+
+
+def test_sequences_of_different_lengths(
+    tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes
+) -> None:
+    store = TutoringStore(tmp_path / "tutoring")
+    short, *_ = bar_episodes(steps=10)
+    *_, long = bar_episodes(steps=25)
+    store.add(short)
+    store.add(long)
+    trainer = Trainer(small_config(), store)
+    assert np.isfinite(train(trainer, 10)).all()
+
+
+def test_what_cannot_be_learned_from_is_refused(
+    store: TutoringStore, small_config: MakeConfig, bar_episodes: MakeEpisodes
+) -> None:
+    episode = bar_episodes()[0]
+    broken = episode.targets.copy()
+    broken[3, 4] = np.nan
+    store.add(replace(episode, id="trial", kind=Kind.TRIAL))
+    store.add(replace(episode, id="other-task", situation={"side": 1.0}))
+    store.add(replace(episode, id="broken", targets=broken))
+    trainer = Trainer(small_config(pretraining=1), store)
+    trainer.epoch()
+    trainer.epoch()
+    assert trainer.sequences == 5  # coupled training asks for no label
+
+
+def test_none_can_be_learned_from(
+    tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes
+) -> None:
+    store = TutoringStore(tmp_path)
+    store.add(replace(bar_episodes()[0], situation={"side": 1.0}))
+    with pytest.raises(UserError, match=r"has no 'object_y_m' in its situation") as caught:
+        Trainer(small_config(), store).epoch()
+    assert "none of the 1 sequences" in str(caught.value)
+
+
+def test_checkpoint_of_another_network_is_refused(
+    store: TutoringStore, small_config: MakeConfig, tmp_path: Path
+) -> None:
+    path = tmp_path / "training.safetensors"
+    Trainer(small_config(), store).save(path)
+    with pytest.raises(UserError, match=r"network.pfc.units: 8 in the checkpoint, 20 in"):
+        Trainer.restore(path, Config(), store)
+
+
+def test_training_cannot_go_on_from_a_policy(
+    store: TutoringStore, small_config: MakeConfig, tmp_path: Path
+) -> None:
+    config = small_config(pretraining=0)
+    trainer = Trainer(config, store)
+    trainer.epoch()
+    path = tmp_path / "policy.safetensors"
+    path.write_bytes(trainer.policy_bytes(1))
+    with pytest.raises(UserError, match=r"is a policy: it can act, but"):
+        Trainer.restore(path, config, store)
+
+
+def test_more_epochs_prolong_a_finished_training(
+    store: TutoringStore, small_config: MakeConfig, tmp_path: Path
+) -> None:
+    trainer = Trainer(small_config(pretraining=1, epochs=2), store)
+    train(trainer, 3)
+    path = tmp_path / "training.safetensors"
+    trainer.save(path)
+    longer = Trainer.restore(path, small_config(pretraining=1, epochs=4), store)
+    assert (longer.stage, longer.epochs_done, longer.epochs_total) == (Stage.COUPLED, 2, 4)
+    train(longer, 2)
+    assert longer.finished
+
+
+def test_divergence_is_said_and_stops_the_training(
+    store: TutoringStore, small_config: MakeConfig
+) -> None:
+    trainer = Trainer(small_config(pretraining=0), store)
+    trainer.epoch()
+    with torch.no_grad():
+        trainer.network.outputs.bias[0] = torch.inf
+    with pytest.raises(UserError, match=r"diverged .*: lower learner.rate"):
+        trainer.epoch()
+    assert trainer.epochs_done == 1
