@@ -11,10 +11,11 @@ import os
 import signal
 import threading
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 from actors.player import play
@@ -69,18 +70,21 @@ def play_all(
         player = _Player(config, policy)
         yield from ((job, player.play(job)) for job in jobs)
         return
+    waiting = iter(jobs)
     with _pool(min(workers, len(jobs)), config, policy) as pool:
-        with _interrupts_ignored():  # what is started here goes on ignoring them
-            futures = {pool.submit(_play_here, job): job for job in jobs}
+        with _interrupts_ignored():  # the workers that start here go on ignoring them
+            running = {pool.submit(_play_here, job): job for job in islice(waiting, workers)}
         try:
-            for future in as_completed(futures):
-                yield futures.pop(future), future.result()
+            while running:
+                done, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
+                    job = running.pop(future)
+                    running |= {pool.submit(_play_here, job): job for job in islice(waiting, 1)}
+                    yield job, future.result()
         except BrokenProcessPool as error:
             raise UserError(
                 "a worker process died; if memory is short, try fewer --workers"
             ) from error
-        finally:
-            pool.shutdown(cancel_futures=True)
 
 
 class _Player:

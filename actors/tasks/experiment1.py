@@ -184,8 +184,10 @@ class Experiment1Judge:
                 closing=closing_fraction(joints_deg[9:]),
                 height_m=float(moved[2]),
                 moved_mm=1e3 * float(np.hypot(moved[0], moved[1])),
-                turned_deg=abs(_half_turn(yaw - _yaw_deg(self._start))),
-                yaw_error_deg=abs(_half_turn(np.rad2deg(np.arctan2(axis[1], axis[0])) - yaw)),
+                turned_deg=float(abs(_half_turn(yaw - _yaw_deg(self._start)))),
+                yaw_error_deg=float(
+                    abs(_half_turn(np.rad2deg(np.arctan2(axis[1], axis[0])) - yaw))
+                ),
                 along_mm=1e3 * float(-centre[0] * np.sin(turn) + centre[1] * np.cos(turn)),
                 across_mm=1e3 * float(centre[0] * np.cos(turn) + centre[1] * np.sin(turn)),
                 touched=any(box == "obstacle" for box, _ in report.touches),
