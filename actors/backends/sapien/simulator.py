@@ -36,7 +36,10 @@ OUTSIDE_POSE: Final = looking_at((-0.7, 1.0, 0.55), (0.09, 0.12, 0.11))
 """From the robot's left front, a little above it (world frame, m)."""
 OUTSIDE_FOV_DEG: Final = 52.0
 OUTSIDE_SUPERSAMPLING: Final = 2
-_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)  # Rec. 601
+SKY: Final = 0.4
+"""Grey of what lies beyond all bodies: lighter than the hand, darker than the table."""
+# Rec. 601 luma of red, green and blue; sky where the fourth value of `Stage.picture` is 0
+_GREY: Final = np.array([0.299, 0.587, 0.114, -SKY], dtype=np.float32)
 _STATIC_LINKS: Final = frozenset({"root_link", "torso_1", "torso_2", "chest"})
 
 
@@ -63,6 +66,7 @@ class SapienSimulator:
         self._scene: Scene | None = None
         self._world_now: World | None = None
         self._targets_deg = np.zeros(18)
+        self._bodies: Mapping[str, Pose] | None = None  # asked for twice in a step
 
     def reset(self, scene: Scene) -> None:
         """Replace whatever was there with `scene`; the same scene gives the same episode."""
@@ -75,6 +79,7 @@ class SapienSimulator:
             _angles_rad(self._targets_deg),
             self._config.physics_period_s,
         )
+        self._bodies = None
         for stage in (self._eye_stage, self._outside_stage):
             if stage is not None:
                 stage.set_boxes(scene.boxes)
@@ -96,6 +101,7 @@ class SapienSimulator:
             self._world.step()
             touches.update(self._world.touches())
         self._targets_deg = after
+        self._bodies = None
         return StepReport(frozenset(touches))
 
     def observe(self, crop: Crop) -> Observation:
@@ -113,19 +119,22 @@ class SapienSimulator:
 
     def bodies(self) -> Mapping[str, Pose]:
         """True pose of every box and of every moving link of the robot, by name."""
-        return {
-            name: Pose(tuple(pose.p.tolist()), tuple(pose.q.tolist()))
-            for name, pose in self._world.poses().items()
-            if name not in _STATIC_LINKS
-        }
+        if self._bodies is None:
+            self._bodies = {
+                name: Pose(tuple(pose.p.tolist()), tuple(pose.q.tolist()))
+                for name, pose in self._world.poses().items()
+                if name not in _STATIC_LINKS
+            }
+        return self._bodies
 
     def show(self, joints_deg: Array, boxes: Mapping[str, Pose]) -> None:
         """Put a recorded state on the stage for pictures; not for use during an episode."""
         self._world.put(_angles_rad(joints_deg), boxes)
+        self._bodies = None
 
     def eye_picture(self, crop: Crop, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the left eye's crop."""
-        return _bytes(self._look(crop, width, height))
+        return _bytes(_before_sky(self._look(crop, width, height)))
 
     def outside_picture(self, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the scene from outside, full meshes."""
@@ -135,7 +144,7 @@ class SapienSimulator:
         focal = height / 2 / math.tan(math.radians(OUTSIDE_FOV_DEG / 2))
         size = (OUTSIDE_SUPERSAMPLING * width, OUTSIDE_SUPERSAMPLING * height)
         fine = self._outside_stage.picture(OUTSIDE_POSE, *size, OUTSIDE_SUPERSAMPLING * focal)
-        return _bytes(_averaged(fine, OUTSIDE_SUPERSAMPLING))
+        return _bytes(_averaged(_before_sky(fine), OUTSIDE_SUPERSAMPLING))
 
     def close(self) -> None:
         """Free what the simulator holds."""
@@ -150,10 +159,10 @@ class SapienSimulator:
     def _grey(self, crop: Crop) -> Image:
         """What the eye sees in a crop, averaged to (48, 64) uint8."""
         size = (SUPERSAMPLING * IMAGE_WIDTH, SUPERSAMPLING * IMAGE_HEIGHT)
-        return _bytes(_averaged(self._look(crop, *size) @ _LUMA, SUPERSAMPLING))
+        return _bytes(_averaged(self._look(crop, *size) @ _GREY + SKY, SUPERSAMPLING))
 
     def _look(self, crop: Crop, width: int, height: int) -> Colours:
-        """Colours (height, width, 3) in 0..1 of what the eye sees in a crop."""
+        """What the eye sees in a crop, (height, width, 4) as in `Stage.picture`."""
         if self._eye_stage is None:
             self._eye_stage = self._make_stage(self._model.seen_by_eye)
         poses = self._world.poses()
@@ -166,6 +175,11 @@ class SapienSimulator:
         if self._scene is not None:
             stage.set_boxes(self._scene.boxes)
         return stage
+
+
+def _before_sky(picture: Colours) -> Colours:
+    """Colours (height, width, 3) of a picture (height, width, 4) of bodies alone."""
+    return np.asarray(picture[..., :3] + SKY * (1.0 - picture[..., 3:]), dtype=np.float32)
 
 
 def _averaged(fine: Colours, factor: int) -> Colours:

@@ -26,8 +26,6 @@ Colours = NDArray[np.float32]
 os.environ.setdefault("LP_NUM_THREADS", "0")
 
 SHADER: Final = Path(__file__).parent / "shader"
-BACKGROUND: Final = np.float32(0.4)
-"""Grey of what lies beyond all bodies: lighter than the hand, darker than the table."""
 NEAR_M: Final = 0.01
 FAR_M: Final = 5.0
 
@@ -59,7 +57,9 @@ class Stage:
             entity.set_pose(poses[name])
 
     def picture(self, eye: sapien.Pose, width: int, height: int, focal: float) -> Colours:
-        """Take a picture (height, width, 3) float32 in 0..1, sRGB, from a pose.
+        """Take a picture (height, width, 4) float32: sRGB colours in 0..1, and what is not sky.
+
+        Where no body is seen, all four values are 0; elsewhere the last is 1.
 
         Args:
             eye: x along the optical axis, y left, z up.
@@ -72,8 +72,7 @@ class Stage:
         camera.set_perspective_parameters(NEAR_M, FAR_M, focal, focal, width / 2, height / 2, 0.0)
         self._system.step()
         camera.take_picture()
-        image = camera.get_picture("Color")
-        return np.where(image[..., 3:] > 0.0, image[..., :3], BACKGROUND)
+        return np.asarray(camera.get_picture("Color"))
 
     def _camera(self, width: int, height: int) -> Any:
         if (width, height) not in self._cameras:
