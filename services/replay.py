@@ -118,13 +118,12 @@ def _focus_before(episode: Episode, step: int, start: float) -> float:
 def _caption(episode: Episode, step: int) -> list[str]:
     policy = episode.policy
     if episode.policy_version:
-        policy += f", version {episode.policy_version}"
+        policy += f" version {episode.policy_version}"
     return [
-        f"{episode.task} in {episode.backend}, {episode.kind}",
+        f"{episode.task} in {episode.backend}, {episode.kind} by {policy}",
         ", ".join(f"{name} {value:.4g}" for name, value in episode.situation.items()),
-        f"policy: {policy}",
+        f"step {step + 1} of {episode.steps}, phase {episode.phases[step]}, "
         f"outcome: {_in_words(episode.outcome)}",
-        f"step {step + 1} of {episode.steps}, phase {episode.phases[step]}",
     ]
 
 
