@@ -145,8 +145,8 @@ def only_one(run_folder: Path, role: Role, process: str) -> Iterator[None]:
     with _lock(run_folder, role, process) as mine:
         if not mine:
             raise UserError(
-                f"a {role} with the id {process!r} already works in {run_folder}: stop it, or "
-                "take another id or run"
+                f"{_a(role)} with the id {process!r} already works in {run_folder}: stop it, or "
+                "choose another --id or run"
             )
         yield
 
@@ -186,7 +186,7 @@ def _lock(run_folder: Path, role: Role, process: str) -> Iterator[bool]:
         yield True
 
 
-def alone_in_run(bus: Bus, lifecycle: Lifecycle) -> None:
+def alone_in_run(bus: Bus, lifecycle: Lifecycle, *, patience_s: float = FROZEN_S) -> None:
     """Make sure, on all machines, that no other process has this one's role.
 
     One that has just frozen is given the time to be given up.
@@ -194,11 +194,15 @@ def alone_in_run(bus: Bus, lifecycle: Lifecycle) -> None:
     Raises:
         UserError: there is another.
     """
-    patience_over_s = time.monotonic() + FROZEN_S
+    patience_over_s = time.monotonic() + patience_s
     while (others := bus.present(bus.role)) and not lifecycle.stopping:
         if time.monotonic() > patience_over_s:
             raise UserError(
-                f"run {bus.keys.run} has a {bus.role} already ({', '.join(sorted(others))}): stop "
-                "it, or choose another run with --set run.name=NAME"
+                f"run {bus.keys.run} has {_a(bus.role)} already ({', '.join(sorted(others))}): "
+                "stop it, or choose another run with --set run.name=NAME"
             )
         lifecycle.wait(0.2)
+
+
+def _a(role: Role) -> str:
+    return f"an {role}" if role[0] in "ae" else f"a {role}"

@@ -42,7 +42,7 @@ def make_episode() -> Callable[..., Episode]:
             body_names=("object", "obstacle"),
             body_poses=walk(steps, 2, 7),
             outcome=Outcome(True, True, False, Reason.IMPRECISE, 0.1, 1, 2, 11, 4, 5, 80, -1),
-            outputs=np.abs(walk(steps, 110)),
+            outputs=random.random((steps, 110), dtype=np.float32),
         )
         return replace(episode, **given)
 
