@@ -63,7 +63,7 @@ setup_packages() {
 }
 
 pip_install() {
-    "$VENV/bin/python" -m pip install --quiet --no-input --disable-pip-version-check \
+    PYTHONWARNINGS=ignore "$VENV/bin/python" -m pip install --quiet --no-input --disable-pip-version-check \
         --root-user-action=ignore "$@" || fail "pip could not install; is the network there?"
 }
 

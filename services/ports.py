@@ -15,13 +15,13 @@ def port_trouble(endpoint: str) -> str | None:
     host, _, port = address.rpartition(":")
     kind = socket.SOCK_DGRAM if protocol in {"udp", "quic"} else socket.SOCK_STREAM
     try:
-        family, _, _, _, place = socket.getaddrinfo(host.strip("[]"), int(port), type=kind)[0]
+        family, _, _, _, place = socket.getaddrinfo(host.strip("[]"), port, type=kind)[0]
         with socket.socket(family, kind) as probe:
             if kind == socket.SOCK_STREAM:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(place)
-    except (OSError, OverflowError) as error:
-        if isinstance(error, OSError) and error.errno == errno.EADDRINUSE:
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
             return (
                 f"hub.endpoint: {endpoint} is in use, perhaps by another run. Stop that one, or "
                 f"choose another port with --set hub.endpoint={protocol}/{host}:PORT"

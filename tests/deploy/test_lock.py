@@ -1,0 +1,55 @@
+"""The lock is complete: a fresh machine needs nothing that it does not name."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib.metadata import requires
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+from services.doctor import LOCK, read_lock
+
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+LOCKED = read_lock(LOCK)
+REPLACED = {"opencv-python"}
+"""Asked for by sapien, and provided by opencv-python-headless."""
+
+
+def wanted_by(package: str) -> list[Requirement]:
+    found = map(Requirement, requires(package) or [])
+    wanted = [r for r in found if r.marker is None or r.marker.evaluate({"extra": ""})]
+    # What builds of torch for other machines ask for besides is not locked.
+    return [r for r in wanted if package != "torch" or canonicalize_name(r.name) in LOCKED]
+
+
+def test_names_are_canonical_and_sorted() -> None:
+    names = list(LOCKED)
+    assert names == sorted(map(canonicalize_name, names))
+
+
+def test_every_requirement_is_locked_in_a_version_that_fits() -> None:
+    asked = [
+        *map(Requirement, PROJECT["dependencies"]),
+        *map(Requirement, PROJECT["optional-dependencies"]["dev"]),
+        *(requirement for package in LOCKED for requirement in wanted_by(package)),
+    ]
+    for requirement in asked:
+        name = canonicalize_name(requirement.name)
+        if name not in REPLACED:
+            assert name in LOCKED, f"{requirement} is not locked"
+            assert Version(LOCKED[name]) in requirement.specifier, requirement
+
+
+def test_nothing_is_locked_that_nobody_asks_for() -> None:
+    project = PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]
+    needed = {"setuptools"}  # builds the project itself
+    waiting = [canonicalize_name(Requirement(line).name) for line in project]
+    while waiting:
+        name = waiting.pop()
+        if name not in needed and name not in REPLACED:
+            needed.add(name)
+            waiting += [canonicalize_name(r.name) for r in wanted_by(name)]
+    assert set(LOCKED) == needed

@@ -1,0 +1,186 @@
+"""The one command: what it refuses, how it stops, that a run goes on, and the whole loop."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from deploy.run_local import (
+    DEFAULT_CONFIG,
+    TOO_MANY_CRASHES,
+    Crashes,
+    ProcessFailedError,
+    default_actors,
+    main,
+    programs,
+)
+from deploy.supervision import ProcessState
+from proto.config import Config, LearnerConfig, load_config
+from tests.ports import free_endpoint
+
+ROOT = Path(__file__).parents[2]
+SMOKE = ROOT / "deploy" / "config" / "smoke.yaml"
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float = 120.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.1)
+
+
+def processes_that_name(text: str) -> list[str]:
+    found = []
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            command = process.read_bytes().replace(b"\0", b" ").decode(errors="replace")
+        except OSError:  # it has just ended
+            continue
+        if text in command:
+            found.append(command)
+    return found
+
+
+@contextmanager
+def started(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """The smoke run in a folder, in a process group of its own as a terminal would give it."""
+    command = (
+        str(ROOT / "deploy" / "run_local.sh"), "--config", str(SMOKE), "--actors", "1",
+        "--set", f"run.folder={folder}", "--set", f"hub.endpoint={free_endpoint()}", *arguments,
+    )  # fmt: skip
+    with subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> None:
+    run = tmp_path / "smoke"
+    with started(tmp_path) as process:
+        wait_for(lambda: any(run.glob("tutoring/*.mcap")))
+        os.killpg(process.pid, signal.SIGINT)  # Ctrl-C
+        output, errors = process.communicate(timeout=90)
+        assert process.returncode == 0, errors
+        assert "starting run smoke with 1 actor" in output
+        assert not processes_that_name(str(tmp_path))
+    kept = {file.name: file.stat().st_mtime_ns for file in run.glob("tutoring/*.mcap")}
+
+    with started(tmp_path) as process:
+        output, errors = process.communicate(timeout=280)
+        assert process.returncode == 0, errors
+        assert "going on with run smoke" in output
+        assert "3 policy versions" in output
+        assert "policy 3, 10 of 10 trials counted" in output
+        assert not processes_that_name(str(tmp_path))
+
+    sequences = {file.name: file.stat().st_mtime_ns for file in run.glob("tutoring/*.mcap")}
+    assert kept.items() <= sequences.items(), "what was taught is not taught again"
+    assert len(sequences) == 3
+    assert len(list(run.glob("policies/*.safetensors"))) == 3
+    assert len(list(run.glob("rollouts/*.mcap"))) >= 10
+    assert load_config(run / "config.yaml").run.name == "smoke"
+
+
+def test_a_process_that_is_given_bad_input_ends_the_run_and_says_why(tmp_path: Path) -> None:
+    with started(tmp_path, "--backend", "nosuchsimulator") as process:
+        _, errors = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert "there is no backend 'nosuchsimulator'" in errors
+    assert not processes_that_name(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("learner.ratee=1", "learner.ratee"),
+        ("learner.rate=fast", "learner.rate"),
+        ("hub.endpoint=tcp/192.0.2.1:7447", "nothing can listen at tcp/192.0.2.1:7447"),
+    ],
+)
+def test_bad_input_starts_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str, said: str
+) -> None:
+    assert main(["--set", f"run.folder={tmp_path}", "--set", setting]) == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_config_starts_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing = tmp_path / "none.yaml"
+    assert main(["--config", str(missing), "--set", f"run.folder={tmp_path / 'runs'}"]) == 2
+    assert str(missing) in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_port_in_use_starts_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        endpoint = f"hub.endpoint=tcp/127.0.0.1:{port}"
+        assert main(["--set", f"run.folder={tmp_path}", "--set", endpoint]) == 2
+    error = capsys.readouterr().err
+    assert f"tcp/127.0.0.1:{port} is in use" in error
+    assert "--set hub.endpoint=" in error
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "config", sorted(DEFAULT_CONFIG.parent.glob("*.yaml")), ids=lambda p: p.stem
+)
+def test_every_config_is_valid_and_can_be_done(config: Path) -> None:
+    assert load_config(config).done.ever
+
+
+def test_threads_and_actors_follow_the_config() -> None:
+    config = Config(learner=LearnerConfig(threads=3))
+    by_name = {program.name: program for program in programs(config, Path("config.yaml"), 5)}
+    assert next(iter(by_name)) == "hub", "all others need it"
+    assert by_name["learner"].threads == 3
+    assert by_name["actor"].threads == 1
+    assert by_name["actor"].processes == 5
+    assert "actor" not in {p.name for p in programs(config, Path("config.yaml"), 0)}
+    assert default_actors(Config(learner=LearnerConfig(threads=1000))) == 1
+
+
+def state(tmp_path: Path, **given: object) -> ProcessState:
+    values = {
+        "name": "actor-1", "state": "RUNNING", "pid": 7, "started_s": 100, "exit_status": 0,
+        "log": tmp_path / "actor-1.log",
+    } | given  # fmt: skip
+    return ProcessState(**values)  # type: ignore[arg-type]
+
+
+def test_a_crash_now_and_then_is_told_and_forgiven(tmp_path: Path) -> None:
+    crashes = Crashes()
+    assert crashes.look([state(tmp_path, started_s=0)]) == []
+    for hour in range(1, 3 * TOO_MANY_CRASHES):
+        back = crashes.look([state(tmp_path, started_s=3600 * hour)])
+        assert bool(back) == (hour > 1), "the first start is no crash"
+        assert crashes.look([state(tmp_path, started_s=3600 * hour)]) == []
+
+
+def test_crashing_again_and_again_ends_the_run(tmp_path: Path) -> None:
+    (tmp_path / "actor-1.log").write_text("one\nno such luck\n")
+    crashes = Crashes()
+    for second in range(TOO_MANY_CRASHES):
+        crashes.look([state(tmp_path, started_s=100 + second)])
+    with pytest.raises(ProcessFailedError, match="no such luck") as failure:
+        crashes.look([state(tmp_path, started_s=100 + TOO_MANY_CRASHES)])
+    assert failure.value.exit_status == 1
