@@ -64,6 +64,21 @@ class Assignment:
     seed: int
 
 
+def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
+    """What is told to whoever watches, in every control step."""
+    return Live(
+        actor=actor,
+        kind=assignment.kind,
+        policy=assignment.policy.name,
+        policy_version=assignment.policy.version,
+        step=live.step,
+        phase=live.phase,
+        image=live.image,
+        joints_deg=live.joints_deg.astype(np.float32),
+        action=live.action.astype(np.float32),
+    )
+
+
 class _StoppedError(Exception):
     """The episode is given up because the actor should stop."""
 
@@ -179,7 +194,8 @@ class ActorProcess:
                 raise _StoppedError
             self._pace.add()
             if self._config.actor.live:
-                self._publish_live(assignment, live)
+                message = live_message(self._bus.id, assignment, live)
+                self._bus.publish(self._bus.keys.live(self._bus.id), message)
 
         return play(
             self._simulator,
@@ -192,20 +208,6 @@ class ActorProcess:
             config_digest=self._digest,
             on_step=on_step,
         )
-
-    def _publish_live(self, assignment: Assignment, live: LiveStep) -> None:
-        message = Live(
-            actor=self._bus.id,
-            kind=assignment.kind,
-            policy=assignment.policy.name,
-            policy_version=assignment.policy.version,
-            step=live.step,
-            phase=live.phase,
-            image=live.image,
-            joints_deg=live.joints_deg.astype(np.float32),
-            action=live.action.astype(np.float32),
-        )
-        self._bus.publish(self._bus.keys.live(self._bus.id), message)
 
     def _send(self, episode: Episode) -> None:
         tutoring = episode.kind is Kind.TUTORING

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import sys
 from collections.abc import Sequence
 from typing import Final, Protocol, cast
@@ -42,6 +43,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one subcommand and return its exit status; bad input prints a message and gives 2."""
+    _use_one_thread()
     parser = argparse.ArgumentParser(
         prog="vmdnn",
         description="Tutor simulated iCub humanoids with VMDNN, from one laptop to a cluster.",
@@ -69,6 +71,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
+
+
+def _use_one_thread() -> None:
+    """Keep numpy from starting a thread for each core, before anything imports it.
+
+    Its products here are small; with many processes on a few cores such threads cost more than ten
+    times what they save. The learner sets the number of its threads itself.
+    """
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
 
 
 if __name__ == "__main__":

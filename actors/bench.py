@@ -1,0 +1,233 @@
+"""How fast an actor plays on this machine, and what its loop costs beside the simulator."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import time
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.attention import crop_of_focus, targets_of_action
+from actors.player import LiveStep, play
+from actors.policies import make_tutor
+from actors.policy import Policy
+from actors.process import Assignment, live_message
+from actors.simulator import Simulator, make_simulator
+from actors.tasks.registry import make_task
+from actors.tasks.task import Situation, Task
+from learner.checkpoint import NETWORK_PREFIX, Checkpoint, CheckpointMetadata, CodeRanges
+from learner.policy import NetworkPolicy
+from learner.subnets import parameter_shapes
+from proto.action import ACTION_VALUES, FOCUS
+from proto.codec import encode
+from proto.config import Config, NetworkConfig
+from proto.episode import Episode, Floats, Image, Kind
+from proto.messages import Rollout
+from proto.metrics import Stage
+
+ROUNDS: Final = 5
+LIMIT_S: Final = 20.0
+"""No further round begins after so long."""
+
+
+@dataclass(frozen=True)
+class ActorSpeed:
+    """What `bench_actor` measured; medians over its rounds.
+
+    Attributes:
+        machine: processor and number of cores.
+        backend: name of the simulator.
+        physics_ms: time of one physics step.
+        render_ms: time of one observation, rendering and all.
+        network_ms: time of one step of the network.
+        steps_per_s: control steps per second of the actor's whole loop.
+        ratio: time of the whole loop over that of the bare simulator doing the same.
+        episode_s: time of one tutored episode.
+    """
+
+    machine: str
+    backend: str
+    physics_ms: float
+    render_ms: float
+    network_ms: float
+    steps_per_s: float
+    ratio: float
+    episode_s: float
+
+
+def bench_actor(config: Config) -> ActorSpeed:
+    """Measure an actor in less than half a minute.
+
+    The whole loop is an episode as the actor's process plays it: observing, the network, judging,
+    recording, and encoding what goes to the bus. The bare loop repeats the same scene with the same
+    actions in the simulator alone. The two take turns, so that both meet the same machine.
+
+    Raises:
+        UserError: the simulator cannot run on this machine.
+    """
+    task = make_task(config.task)
+    situation = task.tutored()[len(task.tutored()) // 2]
+    tutor = make_tutor(config, noisy=False)
+    pupil = _Pupil(tutor, random_network(config.network))
+    rounds: list[_Round] = []
+    with closing(make_simulator(config.simulator)) as simulator:
+        _episode(simulator, task, tutor, situation)  # warms up
+        end = time.perf_counter() + LIMIT_S
+        while len(rounds) < ROUNDS and (not rounds or time.perf_counter() < end):
+            rounds.append(_round(simulator, task, situation, tutor, pupil))
+        backend = simulator.name
+    steps = rounds[0].steps
+    return ActorSpeed(
+        machine=_machine(),
+        backend=backend,
+        physics_ms=1e3 * median(r.physics_s for r in rounds) / (steps * config.simulator.substeps),
+        render_ms=1e3 * median(r.render_s for r in rounds) / steps,
+        network_ms=1e3 * median(r.network_s for r in rounds) / steps,
+        steps_per_s=steps / median(r.whole_s for r in rounds),
+        ratio=median(r.whole_s for r in rounds) / median(r.bare_s for r in rounds),
+        episode_s=median(r.tutored_s for r in rounds),
+    )
+
+
+@dataclass(frozen=True)
+class _Round:
+    steps: int
+    whole_s: float
+    network_s: float
+    bare_s: float
+    physics_s: float
+    render_s: float
+    tutored_s: float
+
+
+class _Stopwatch:
+    """Adds up how long `with` blocks take."""
+
+    def __init__(self) -> None:
+        self.total_s = 0.0
+
+    def __enter__(self) -> None:
+        self._started = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self.total_s += time.perf_counter() - self._started
+
+
+class _Pupil:
+    """Steps a network, but does as the tutor says: all of its work, and a real grasp."""
+
+    name = "bench"
+    version = 0
+    looks = True
+    target: NDArray[np.float64] | None = None
+
+    def __init__(self, tutor: Policy, network: NetworkPolicy) -> None:
+        self._tutor = tutor
+        self._network = network
+        self.outputs: Floats | None = None
+        self.stopwatch = _Stopwatch()
+
+    def begin(self, situation: Situation, seed: int) -> None:
+        self._tutor.begin(situation, seed)
+        self._network.begin(situation, seed)
+        self.stopwatch = _Stopwatch()
+
+    def step(self, image: Image) -> NDArray[np.float64]:
+        with self.stopwatch:
+            self._network.step(image)
+        self.outputs = self._network.outputs
+        return self._tutor.step(image)
+
+
+def random_network(config: NetworkConfig) -> NetworkPolicy:
+    """A network of the configured sizes that has learned nothing."""
+    rng = np.random.default_rng(0)
+    tensors = {
+        NETWORK_PREFIX + name: rng.uniform(-0.1, 0.1, shape).astype(np.float32)
+        for name, shape in parameter_shapes(config).items()
+    }
+    metadata = CheckpointMetadata(
+        run="bench",
+        version=0,
+        stage=Stage.COUPLED,
+        epoch=0,
+        loss=None,
+        config_digest="",
+        network=config,
+        code=CodeRanges(
+            minima=tuple(value.minimum for value in ACTION_VALUES),
+            maxima=tuple(value.maximum for value in ACTION_VALUES),
+        ),
+    )
+    return NetworkPolicy(Checkpoint(metadata, tensors), "the network of the benchmark")
+
+
+def _round(
+    simulator: Simulator, task: Task, situation: Situation, tutor: Policy, pupil: _Pupil
+) -> _Round:
+    whole, bare, physics, render, tutored = (_Stopwatch() for _ in range(5))
+    with whole:
+        episode = _episode(simulator, task, pupil, situation)
+    with bare:
+        _repeat(simulator, task, episode, physics, render)
+    with tutored:
+        _episode(simulator, task, tutor, situation)
+    return _Round(
+        steps=episode.steps,
+        whole_s=whole.total_s,
+        network_s=pupil.stopwatch.total_s,
+        bare_s=bare.total_s,
+        physics_s=physics.total_s,
+        render_s=render.total_s,
+        tutored_s=tutored.total_s,
+    )
+
+
+def _episode(simulator: Simulator, task: Task, policy: Policy, situation: Situation) -> Episode:
+    """An episode as the actor's process plays it, but for the wire itself."""
+    assignment = Assignment(Kind.TRIAL, policy, situation, seed=0)
+
+    def on_step(live: LiveStep) -> None:
+        encode(live_message("bench", assignment, live))
+
+    episode = play(
+        simulator, task, policy, situation, seed=0, kind=assignment.kind, on_step=on_step
+    )
+    encode(Rollout(episode, "bench"))
+    return episode
+
+
+def _repeat(
+    simulator: Simulator, task: Task, episode: Episode, physics: _Stopwatch, render: _Stopwatch
+) -> None:
+    """The same scene and the same actions again, in the simulator alone."""
+    simulator.reset(task.scene(episode.situation))
+    focus = float(task.start[FOCUS])
+    for action in episode.actions:
+        with render:
+            simulator.observe(crop_of_focus(focus))
+        with physics:
+            simulator.step(targets_of_action(np.asarray(action, dtype=np.float64)))
+        focus = float(action[FOCUS])
+
+
+def _machine() -> str:
+    cores = len(os.sched_getaffinity(0))
+    return f"{_processor()}, {cores} core{'s' if cores > 1 else ''}"
+
+
+def _processor() -> str:
+    try:
+        text = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        text = ""
+    found = re.search(r"^model name\s*: (.*)$", text, re.MULTILINE)
+    return found[1] if found else platform.processor() or platform.machine()
