@@ -1,0 +1,238 @@
+"""The learner as a process: asks, keeps, trains, publishes, and carries on after a kill."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from subprocess import Popen
+
+import numpy as np
+import pytest
+from ports import free_endpoint
+from processes import eventually, run_vmdnn, stop, vmdnn
+
+from actors.tasks.registry import make_task
+from learner.policy import NetworkPolicy
+from proto.bus import Bus, open_bus
+from proto.config import HubConfig, TaskConfig
+from proto.episode import Episode, Kind
+from proto.keys import Role
+from proto.messages import (
+    Command,
+    Control,
+    ControlReply,
+    PolicyVersion,
+    Receipt,
+    Sequence,
+    TutoringCase,
+    TutoringRequest,
+)
+from proto.metrics import LearnerMetrics, Stage
+from proto.recording import read_episode
+
+MakeEpisode = Callable[..., Episode]
+CASES = make_task(TaskConfig()).tutored()
+SETTINGS = {
+    "run.name": "test",
+    "tutor.repeats": 1,
+    "learner.cases": [0, 20, 44],
+    "learner.start_sequences": 45,
+    "learner.pretraining.epochs": 2,
+    "learner.epochs": 400,
+    "learner.publish_every_epochs": 5,
+    "learner.checkpoint_every_epochs": 7,
+    "done.policy_versions": 3,
+}
+
+
+class School:
+    """A hub, a learner, and a session that acts as an actor."""
+
+    def __init__(self, stack: ExitStack, folder: Path, make_episode: MakeEpisode) -> None:
+        self._stack = stack
+        self._make_episode = make_episode
+        self.folder = folder / "test"
+        self.endpoint = free_endpoint()
+        self.words = ["--connect", self.endpoint, "--set", f"run.folder={folder}"]
+        for key, value in SETTINGS.items():
+            self.words += ["--set", f"{key}={value}"]
+        stack.enter_context(vmdnn("hub", "--connect", self.endpoint))
+        self.actor = self.join("actor")
+        self.actor.announce()
+        self.policies: list[PolicyVersion] = []
+        self.told: LearnerMetrics | None = None
+        self._receipts: list[Receipt] = []
+        keys = self.actor.keys
+        self.actor.subscribe_newest(keys.policy, self.policies.append, PolicyVersion)
+        self.actor.subscribe(keys.metrics(Role.LEARNER), self._listen, LearnerMetrics)
+        self.actor.subscribe(keys.receipt("actor"), self._receipts.append, Receipt)
+        self.process: Popen[bytes]
+
+    def start(self, *more: str) -> None:
+        self.told = None
+        self.process = self._stack.enter_context(vmdnn("learner", *self.words, *more))
+
+    def join(self, name: str) -> Bus:
+        bus = open_bus(HubConfig(endpoint=self.endpoint), "test", Role.ACTOR, name)
+        return self._stack.enter_context(bus)
+
+    def ask(self) -> list[TutoringCase]:
+        request = TutoringRequest("actor")
+        return self.actor.ask(self.actor.keys.request_tutoring, request, TutoringCase)
+
+    def ask_until_given(self) -> TutoringCase:
+        cases: list[TutoringCase] = []
+
+        def given() -> bool:
+            cases.extend(self.ask())
+            return bool(cases)
+
+        eventually(given, "a case to show")
+        return cases[0]
+
+    def episode(self, case: TutoringCase, **fields: object) -> Episode:
+        given = {"id": f"case{case.case}", "seed": case.seed, **fields}
+        return self._make_episode(
+            20, kind=Kind.TUTORING, actor="actor", situation=dict(CASES[case.case]), **given
+        )
+
+    def send(self, episode: Episode) -> None:
+        """Send a sequence until its receipt comes."""
+        self._receipts.clear()
+
+        def received() -> bool:
+            self.actor.deliver(self.actor.keys.sequence("actor"), Sequence(episode))
+            return Receipt(episode.id) in self._receipts
+
+        eventually(received, "a receipt")
+
+    def show_all(self) -> None:
+        for case in SETTINGS["learner.cases"]:  # type: ignore[attr-defined]
+            self.send(self.episode(TutoringCase(case, 0)))
+
+    def tells(self, what: Callable[[LearnerMetrics], bool]) -> LearnerMetrics:
+        eventually(lambda: self.told is not None and what(self.told), "the metrics it should tell")
+        assert self.told is not None
+        return self.told
+
+    def _listen(self, metrics: LearnerMetrics) -> None:
+        self.told = metrics
+
+
+@pytest.fixture
+def school(tmp_path: Path, make_episode: MakeEpisode) -> Iterator[School]:
+    with ExitStack() as stack:
+        yield School(stack, tmp_path, make_episode)
+
+
+def test_it_asks_for_each_case_once_and_keeps_what_it_is_shown(school: School) -> None:
+    school.start()
+    given = [school.ask_until_given(), *school.ask(), *school.ask(), *school.ask()]
+    assert given == [TutoringCase(case, 0) for case in (0, 20, 44)]
+    told = school.tells(lambda told: told.stage is Stage.WAITING)
+    assert (told.sequences, told.loss, told.policy_version) == (0, None, 0)
+
+    school.send(school.episode(given[0]))
+    school.send(school.episode(given[0]))
+    school.send(school.episode(given[0], id="the-same-case-shown-by-another"))
+    school.send(school.episode(TutoringCase(7, 0), id="a-case-nobody-asked-for"))
+    school.send(school.episode(given[1], task="experiment9", id="another-task"))
+    school.tells(lambda told: told.sequences == 1)
+    kept = list((school.folder / "tutoring").iterdir())
+    assert [path.name for path in kept] == ["case0.mcap"]
+    sent = school.episode(given[0])
+    assert np.array_equal(read_episode(kept[0]).images, sent.images)
+
+    # what was shown is not asked for again, what the actor took with it is
+    school.process.kill()
+    school.process.wait()
+    school.start()
+    assert school.ask_until_given() == TutoringCase(20, 0)
+    assert stop(school.process) == 0
+
+
+def test_a_killed_learner_publishes_its_policy_again_and_goes_on(school: School) -> None:
+    school.start()
+    school.show_all()
+    eventually(lambda: len(school.policies) >= 3, "three policies")
+    school.process.kill()
+    school.process.wait()
+    before = list(school.policies)
+    assert [policy.version for policy in before] == list(range(1, len(before) + 1))
+    assert [policy.epoch for policy in before] == [5 * policy.version for policy in before]
+    policy = NetworkPolicy.from_bytes(before[-1].weights)
+    assert policy.version == before[-1].version
+    assert policy.step(np.zeros((48, 64), np.uint8)).shape == (11,)
+
+    school.policies.clear()
+    school.start()
+    eventually(lambda: len(school.policies) >= 3, "policies after the restart")
+    again = school.policies[0]
+    known = len(list((school.folder / "policies").iterdir()))
+    # it may have written one more than anyone heard of before it was killed
+    assert again.version in {before[-1].version, before[-1].version + 1}
+    assert again.version < known
+    if again.version == before[-1].version:
+        assert again == before[-1]
+    assert {policy.run_id for policy in school.policies} == {before[0].run_id}
+    versions = [policy.version for policy in school.policies]
+    assert versions == list(range(again.version, again.version + len(versions)))
+    assert [policy.epoch for policy in school.policies] == [5 * version for version in versions]
+    assert school.ask() == [], "everything was shown before"
+    school.tells(lambda told: told.done and told.sequences == 3)
+
+
+def test_it_obeys_and_a_clean_stop_loses_no_epoch(school: School) -> None:
+    school.start()
+    school.show_all()
+    school.tells(lambda told: told.stage is Stage.COUPLED and told.epoch > 0)
+
+    def tell(command: Command) -> str:
+        control = school.actor.keys.control(Role.LEARNER)
+        replies = school.actor.ask(control, Control(command), ControlReply, timeout_s=20.0)
+        return " ".join(reply.note for reply in replies)
+
+    assert tell(Command.PAUSE) == "paused"
+    paused = school.tells(lambda told: told.paused and told.epochs_per_s == 0)
+    assert school.tells(lambda told: told.time_s > paused.time_s).epoch == paused.epoch
+    checkpoint = school.folder / "checkpoints" / "training.safetensors"
+    assert tell(Command.CHECKPOINT) == f"saved coupled epoch {paused.epoch} to {checkpoint}"
+    tell(Command.RESUME)
+    school.tells(lambda told: told.epoch > paused.epoch)
+    assert stop(school.process) == 0
+    last = school.told
+    assert last is not None
+    school.start("--set", "learner.publish_every_epochs=400")
+    tell_again = school.tells(lambda told: told.stage is not Stage.WAITING)
+    assert tell_again.epoch >= last.epoch
+
+
+def test_the_last_epoch_gives_a_policy_and_then_it_rests(school: School) -> None:
+    school.start("--set", "learner.epochs=8")
+    school.show_all()
+    told = school.tells(lambda told: told.stage is Stage.FINISHED)
+    eventually(lambda: [p.epoch for p in school.policies] == [5, 8], "two policies")
+    assert (told.epoch, told.epochs_total, told.policy_version) == (8, 8, 2)
+    assert not told.done, "the configuration asks for three versions"
+    assert stop(school.process) == 0
+
+
+def test_a_training_of_another_network_is_refused_and_kept(school: School) -> None:
+    school.start("--set", "learner.epochs=6")
+    school.show_all()
+    school.tells(lambda told: told.stage is Stage.FINISHED)
+    assert stop(school.process) == 0
+    checkpoint = school.folder / "checkpoints" / "training.safetensors"
+    before = checkpoint.read_bytes()
+    ended = run_vmdnn("learner", *school.words, "--set", "network.pfc.units=7")
+    assert ended.returncode == 2
+    assert "network.pfc" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert checkpoint.read_bytes() == before
+
+
+def test_a_wrong_case_is_said_before_anything_starts(school: School) -> None:
+    ended = run_vmdnn("learner", *school.words, "--set", "learner.cases=[45]")
+    assert ended.returncode == 2
+    assert "learner.cases: there is no case 45" in ended.stderr
