@@ -1,0 +1,28 @@
+"""`vmdnn bench actor --json`: what it prints, not how fast this machine is."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from actors import bench
+from services.cli import main
+
+
+def test_prints_what_was_measured(monkeypatch, capsys):
+    monkeypatch.setattr(bench, "ROUNDS", 1)
+    assert main(["bench", "actor", "--json"]) == 0
+    speed = json.loads(capsys.readouterr().out)
+    assert list(speed)[:7] == [
+        "machine", "backend", "physics_ms", "render_ms", "network_ms", "steps_per_s", "ratio",
+    ]  # fmt: skip
+    assert speed["backend"] == "sapien"
+    assert "core" in speed["machine"]
+    assert all(speed[name] > 0 for name in list(speed)[2:])
+
+
+def test_needs_a_subject(capsys):
+    with pytest.raises(SystemExit, match="2"):
+        main(["bench"])
+    assert "SUBJECT" in capsys.readouterr().err
