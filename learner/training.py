@@ -56,9 +56,9 @@ class Trainer:
 
     Attributes:
         network: the network.
-        stage: pre-training, coupled training, or finished.
+        stage: that of the last epoch: pre-training or coupled training; or finished.
         epochs_done: epochs done in this stage.
-        loss: mean loss of the last epoch of this stage, or None before the first.
+        loss: mean loss of the last epoch, or None before the first.
         version: version of the newest policy, 0 for none yet.
     """
 
@@ -146,13 +146,14 @@ class Trainer:
         """
         if self.finished:
             raise RuntimeError("the training is finished")
+        if self.stage is Stage.PRETRAINING and self.epochs_done >= self.epochs_total:
+            self._enter(Stage.COUPLED)
         self._take_in(self._intake.new())
         if self._optimization is None:
             raise UserError(self._intake.complaint())
         self.loss = loss = self._optimization.epoch(self.epochs_done, self._generator)
         self.epochs_done += 1
-        if self.epochs_done >= self.epochs_total:
-            self._finish_stage()
+        self._finish_if_done()
         return loss
 
     def mean_errors(self) -> NDArray[np.float64]:
@@ -189,10 +190,8 @@ class Trainer:
         self._lesson = None
         self._optimization = None
 
-    def _finish_stage(self) -> None:
-        if self.stage is Stage.PRETRAINING:
-            self._enter(Stage.COUPLED)
-        else:
+    def _finish_if_done(self) -> None:
+        if self.stage is Stage.COUPLED and self.epochs_done >= self.epochs_total:
             self.stage = Stage.FINISHED
 
     def _make_intake(self) -> Intake:
@@ -262,8 +261,7 @@ class Trainer:
         if isinstance(lesson, Pretraining):
             lesson.classifier.load_state_dict(_tensors(checkpoint.part(_CLASSIFIER_PREFIX)))
         self._generator.set_state(_tensors(checkpoint.tensors)[_RANDOM_STATE])
-        if self.epochs_done >= self.epochs_total:  # always so when the training was finished
-            self._finish_stage()
+        self._finish_if_done()
 
     def _lesson_of(
         self, metadata: CheckpointMetadata, training: TrainingMetadata

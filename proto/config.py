@@ -121,6 +121,20 @@ class NetworkConfig(_Section):
     code_width: Positive = 0.6
     update_order: Literal["bottom_up", "literal"] = "bottom_up"
 
+    @model_validator(mode="before")
+    @classmethod
+    def _rest_is_the_papers(cls, values: Any) -> Any:
+        """Let a config name only what differs, such as `pfc: {tau: 30}`."""
+        if not isinstance(values, dict):
+            return values
+        given = {name: value for name, value in values.items() if isinstance(value, dict)}
+        defaults = {
+            name: field.default.model_dump()
+            for name, field in cls.model_fields.items()
+            if name in given and isinstance(field.default, BaseModel)
+        }
+        return values | {name: known | given[name] for name, known in defaults.items()}
+
 
 class PretrainingConfig(_Section):
     """Pre-training of the MSTNN as a delayed-response classifier (section 3.3)."""

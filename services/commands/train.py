@@ -20,6 +20,7 @@ from learner.store import TutoringStore
 from learner.training import Trainer
 from proto.action import ARM, FOCUS, GRASP, NECK
 from proto.errors import UserError
+from proto.metrics import Stage
 from services.commands.options import add_config, config_of
 
 _INTERRUPTED: Final = 130
@@ -111,7 +112,7 @@ def _progress(trainer: Trainer) -> Iterator[Callable[[float], None]]:
         def show(loss: float) -> None:
             progress.update(
                 bar,
-                description=f"{trainer.stage} on {trainer.sequences} sequences",
+                description=f"{_stage(trainer)} on {trainer.sequences} sequences",
                 completed=trainer.epochs_done,
                 total=trainer.epochs_total,
                 loss=f"{loss:.5f}",
@@ -128,17 +129,21 @@ def _line_printer(trainer: Trainer) -> Callable[[float], None]:
         nonlocal last, epochs
         epochs += 1
         elapsed = time.monotonic() - last
-        stage_over = trainer.epochs_done in {0, trainer.epochs_total}
+        stage_over = trainer.epochs_done == trainer.epochs_total
         if elapsed < _LINE_PERIOD_S and not stage_over:
             return
         print(
-            f"{trainer.stage} epoch {trainer.epochs_done}/{trainer.epochs_total}"
+            f"{_stage(trainer)} epoch {trainer.epochs_done}/{trainer.epochs_total}"
             f" loss {loss:.5f} sequences {trainer.sequences} {elapsed / epochs:.3f} s/epoch",
             flush=True,
         )
         last, epochs = time.monotonic(), 0
 
     return show
+
+
+def _stage(trainer: Trainer) -> Stage:
+    return Stage.COUPLED if trainer.finished else trainer.stage
 
 
 def _print_summary(trainer: Trainer, folder: Path) -> None:

@@ -10,7 +10,7 @@ from subprocess import Popen
 import numpy as np
 import pytest
 from ports import free_endpoint
-from processes import eventually, run_vmdnn, stop, vmdnn
+from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 
 from actors.tasks.registry import make_task
 from learner.policy import NetworkPolicy
@@ -57,7 +57,7 @@ class School:
         self.words = ["--connect", self.endpoint, "--set", f"run.folder={folder}"]
         for key, value in SETTINGS.items():
             self.words += ["--set", f"{key}={value}"]
-        stack.enter_context(vmdnn("hub", "--connect", self.endpoint))
+        stack.enter_context(listening_hub(self.endpoint))
         self.actor = self.join("actor")
         self.actor.announce()
         self.policies: list[PolicyVersion] = []
