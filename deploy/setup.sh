@@ -36,7 +36,7 @@ sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))' 2>/dev/null; then
 }
 
 setup_python() {
-    [[ -x "$VENV/bin/python" ]] && return
+    "$VENV/bin/python" -c 'import pip' 2>/dev/null && return
     if ! PYTHON="$(find_python)"; then
         can_install || fail "Python 3.11 or 3.12 with venv is needed; as root: $(apt_line python3 python3-venv)"
         apt_install python3 python3-venv
