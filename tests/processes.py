@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,6 +24,20 @@ def vmdnn(*words: str | Path, log: Path | None = None) -> Iterator[subprocess.Po
     finally:
         process.kill()
         process.wait(PATIENCE_S)
+
+
+@contextmanager
+def listening_hub(endpoint: str, *words: str | Path) -> Iterator[subprocess.Popen[bytes]]:
+    """`vmdnn hub` as a process of its own that accepts connections."""
+    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+
+    def listens() -> bool:
+        with socket.socket() as probe:
+            return probe.connect_ex((host, int(port))) == 0
+
+    with vmdnn("hub", "--connect", endpoint, *words) as process:
+        eventually(listens, f"a hub at {endpoint}")
+        yield process
 
 
 def run_vmdnn(*words: str | Path) -> subprocess.CompletedProcess[str]:
@@ -48,8 +63,3 @@ def eventually(reached: Callable[[], bool], what: str, patience_s: float = PATIE
     while not reached():
         assert time.monotonic() < over_s, f"never happened: {what}"
         time.sleep(0.05)
-
-
-def all_running(processes: Sequence[subprocess.Popen[bytes]]) -> bool:
-    """Whether none of them has ended."""
-    return all(process.poll() is None for process in processes)

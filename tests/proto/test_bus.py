@@ -11,7 +11,7 @@ from subprocess import Popen
 import pytest
 import zenoh
 from ports import free_endpoint
-from processes import eventually, run_vmdnn, stop, vmdnn
+from processes import eventually, listening_hub, run_vmdnn, stop
 
 from proto.bus import Bus, open_bus, open_hub
 from proto.codec import encode
@@ -33,7 +33,7 @@ class Network:
         self.start_hub()
 
     def start_hub(self) -> None:
-        self.hub = self._stack.enter_context(vmdnn("hub", "--connect", self.endpoint))
+        self.hub = self._stack.enter_context(listening_hub(self.endpoint))
 
     def join(self, role: Role, name: str) -> Bus:
         bus = open_bus(HubConfig(endpoint=self.endpoint), "test", role, name)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from ports import free_endpoint
-from processes import eventually, vmdnn
+from processes import eventually, listening_hub
 
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig
@@ -41,7 +41,7 @@ def test_a_member_is_present_tells_and_obeys() -> None:
     endpoint = free_endpoint()
     config = HubConfig(endpoint=endpoint)
     with (
-        vmdnn("hub", "--connect", endpoint),
+        listening_hub(endpoint),
         open_bus(config, "test", Role.RECORDER, "clerk") as bus,
         open_bus(config, "test", Role.WATCH, "watcher") as watcher,
     ):
@@ -69,7 +69,7 @@ def test_only_one_of_a_role_in_a_run() -> None:
     endpoint = free_endpoint()
     config = HubConfig(endpoint=endpoint)
     with (
-        vmdnn("hub", "--connect", endpoint),
+        listening_hub(endpoint),
         open_bus(config, "test", Role.LEARNER, "first") as first,
         open_bus(config, "test", Role.LEARNER, "second") as second,
         open_bus(config, "other", Role.LEARNER, "third") as third,

@@ -9,7 +9,7 @@ from subprocess import Popen
 
 import pytest
 from ports import free_endpoint
-from processes import eventually, run_vmdnn, stop, vmdnn
+from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig
@@ -45,7 +45,7 @@ class Field:
             *("--set", "evaluator.seed=70", "--set", "done.trials=3"),
             *("--set", "done.policy_versions=2"),
         )
-        stack.enter_context(vmdnn("hub", "--connect", self.endpoint))
+        stack.enter_context(listening_hub(self.endpoint))
         self.told: EvaluatorMetrics | None = None
         self.learner = self.join(Role.LEARNER, "learner")
         self.learner.subscribe(

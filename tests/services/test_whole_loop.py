@@ -1,0 +1,134 @@
+"""Hub, learner, evaluator, recorder and actors together, and killed in the middle of it all."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from contextlib import ExitStack
+from pathlib import Path
+from subprocess import Popen
+
+from ports import free_endpoint
+from processes import eventually, listening_hub, stop, vmdnn
+
+from proto.bus import open_bus
+from proto.config import HubConfig
+from proto.keys import Role
+from proto.messages import Live, PolicyVersion
+from proto.metrics import METRICS, EvaluatorMetrics, LearnerMetrics, Metrics
+from proto.recording import read_episode
+
+VERSIONS = 4
+TRIALS = 4
+CASES = (0, 11, 22, 44)
+SETTINGS = {
+    "run.name": "loop",
+    "simulator.render": "false",
+    "actor.practice": "false",
+    "tutor.repeats": 2,
+    "learner.cases": list(CASES),
+    "learner.start_sequences": 4,
+    "learner.pretraining.epochs": 2,
+    "learner.epochs": 30 * VERSIONS,
+    "learner.publish_every_epochs": 30,
+    "learner.checkpoint_every_epochs": 10,
+    "evaluator.trials_per_policy": TRIALS,
+    "done.policy_versions": VERSIONS,
+    "done.trials": TRIALS,
+}
+
+
+class Loop:
+    """The processes of a run, by name."""
+
+    def __init__(self, stack: ExitStack, folder: Path) -> None:
+        self._stack = stack
+        self.folder = folder / "loop"
+        self.endpoint = free_endpoint()
+        self._words = ["--connect", self.endpoint, "--set", f"run.folder={folder}"]
+        for key, value in SETTINGS.items():
+            self._words += ["--set", f"{key}={value}"]
+        self.processes: dict[str, Popen[bytes]] = {}
+
+    def start(self, role: str, name: str) -> None:
+        self.processes[name] = self._stack.enter_context(
+            vmdnn(role, *self._words, "--id", name, log=self.folder.parent / f"{name}.log")
+        )
+
+    def start_hub(self) -> None:
+        hub = listening_hub(self.endpoint, "--set", "run.name=loop")
+        self.processes["hub"] = self._stack.enter_context(hub)
+
+    def kill_and_restart(self, role: str, name: str) -> None:
+        self.processes[name].kill()
+        self.processes[name].wait()
+        self.start(role, name)
+
+    def stop_all(self) -> list[int]:
+        return [stop(self.processes[name]) for name in reversed(self.processes)]
+
+
+def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        loop = Loop(stack, tmp_path)
+        loop.start_hub()
+        for role in ("learner", "evaluator", "recorder"):
+            loop.start(role, role)
+        for name in ("actor-1", "actor-2"):
+            loop.start("actor", name)
+        config = HubConfig(endpoint=loop.endpoint)
+        bus = stack.enter_context(open_bus(config, "loop", Role.WATCH, "watch"))
+        lives: list[Live] = []
+        policies: list[PolicyVersion] = []
+        told: dict[str, Metrics] = {}
+        bus.subscribe(bus.keys.live("actor-1"), lives.append, Live)
+        bus.subscribe_newest(bus.keys.policy, policies.append, PolicyVersion)
+        bus.subscribe(bus.keys.metrics(), lambda m: told.update({m.id: m}), *METRICS)
+
+        eventually(lambda: any(live.step > 20 for live in lives), "a demonstration is going on")
+        loop.kill_and_restart("actor", "actor-1")
+        eventually(lambda: len(policies) >= 1, "a policy")
+        loop.kill_and_restart("learner", "learner")
+        trials = loop.folder / "evaluation" / "trials.jsonl"
+        eventually(lambda: trials.exists() and trials.stat().st_size > 0, "a counted trial")
+        loop.kill_and_restart("evaluator", "evaluator")
+        loop.processes["hub"].kill()
+        loop.start_hub()
+        lives.clear()
+        eventually(lambda: any(live.step > 20 for live in lives), "a trial is going on")
+        loop.kill_and_restart("actor", "actor-1")
+
+        def done() -> bool:
+            learner, evaluator = told.get("learner"), told.get("evaluator")
+            return (
+                isinstance(learner, LearnerMetrics)
+                and isinstance(evaluator, EvaluatorMetrics)
+                and learner.done
+                and evaluator.done
+            )
+
+        eventually(done, "the run is done", patience_s=150.0)
+        evaluated = told["evaluator"]
+        assert loop.stop_all() == [0] * 6
+
+    assert isinstance(evaluated, EvaluatorMetrics)
+    sequences = [read_episode(path) for path in (loop.folder / "tutoring").glob("*.mcap")]
+    planned = [case * 1000 + repeat for case in CASES for repeat in (0, 1)]
+    assert sorted(episode.seed for episode in sequences) == sorted(planned)
+
+    versions = [policy.version for policy in policies]
+    assert versions == sorted(versions)
+    assert set(versions) == set(range(1, VERSIONS + 1))
+    assert len({policy.run_id for policy in policies}) == 1
+
+    counted = [json.loads(line) for line in trials.read_text().splitlines()]
+    each = Counter((trial["policy_version"], trial["seed"]) for trial in counted)
+    assert set(each.values()) == {1}
+    seeds = {trial["seed"] for trial in counted if trial["policy_version"] == VERSIONS}
+    assert seeds == set(range(1000, 1000 + TRIALS))
+    assert {score.version: score.trials for score in evaluated.policies} == Counter(
+        trial["policy_version"] for trial in counted
+    )
+    recorded = {path.stem for path in (loop.folder / "rollouts").glob("*.mcap")}
+    assert {trial["episode"] for trial in counted} <= recorded
+    assert list((loop.folder / "outbox").glob("*/*")) == []
