@@ -16,6 +16,7 @@ import pytest
 from actors.backends.sapien.simulator import SapienSimulator
 from actors.simulator import ROBOT, Box, Crop, JointTargets, Pose, Scene
 from proto.config import SimulatorConfig
+from proto.errors import UserError
 from sim_assets.hand import motors_from_grasp
 
 ARM = (-30.0, 30.0, 30.0, 60.0, -30.0, -30.0, 10.0)
@@ -323,3 +324,9 @@ def test_without_rendering_no_graphics_driver_is_needed():
         check=False,
     )
     assert result.stdout == "played\n", result.stderr
+
+
+def test_a_cache_that_cannot_be_written_is_explained(monkeypatch):
+    monkeypatch.setenv("VMDNN_CACHE", "/proc/nowhere")
+    with pytest.raises(UserError, match="VMDNN_CACHE"):
+        SapienSimulator(SimulatorConfig(render=False))

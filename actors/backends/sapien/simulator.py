@@ -24,12 +24,20 @@ from actors.simulator import (
 )
 from proto.action import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import SimulatorConfig
+from proto.errors import UserError
 from sim_assets.hand import joints_from_motors, motors_from_joints
-from sim_assets.icub import EYE, build_icub
+from sim_assets.icub import EYE, IcubModel, build_icub
 from sim_assets.icub_visuals import Visual
+
+
+def _focal(fov_deg: float, pixels: int) -> float:
+    """Focal length in pixels of a camera that sees so much across so many pixels."""
+    return pixels / 2 / math.tan(math.radians(fov_deg / 2))
+
 
 EYE_FOV_DEG: Final = 50.0
 """Vertical field of view of the whole eye image."""
+_EYE_FOCAL: Final = _focal(EYE_FOV_DEG, EYE_HEIGHT)
 SUPERSAMPLING: Final = 3
 """Rendered pixels along each side of one pixel of the network's picture."""
 OUTSIDE_POSE: Final = looking_at((-0.7, 1.0, 0.55), (0.09, 0.12, 0.11))
@@ -49,7 +57,8 @@ class SapienSimulator:
     With `config.render` false nothing graphical is touched and every observed image is black.
 
     Raises:
-        UserError: pictures are wanted, but this machine cannot render; the message says what to do.
+        UserError: pictures are wanted, but this machine cannot render; or the robot's model cannot
+            be built. The message says what to do.
     """
 
     name = "sapien"
@@ -59,7 +68,7 @@ class SapienSimulator:
         if config.render:
             require_graphics()
         self._config = config
-        self._model = build_icub()
+        self._model = _built_robot()
         self._builder = RobotBuilder(self._model)
         self._eye_stage: Stage | None = None
         self._outside_stage: Stage | None = None
@@ -141,9 +150,9 @@ class SapienSimulator:
         if self._outside_stage is None:
             self._outside_stage = self._make_stage(self._model.seen_from_outside)
         self._outside_stage.place(self._world.poses())
-        focal = height / 2 / math.tan(math.radians(OUTSIDE_FOV_DEG / 2))
         size = (OUTSIDE_SUPERSAMPLING * width, OUTSIDE_SUPERSAMPLING * height)
-        fine = self._outside_stage.picture(OUTSIDE_POSE, *size, OUTSIDE_SUPERSAMPLING * focal)
+        focal = _focal(OUTSIDE_FOV_DEG, size[1])
+        fine = self._outside_stage.picture(OUTSIDE_POSE, *size, (focal, focal))
         return _bytes(_averaged(_before_sky(fine), OUTSIDE_SUPERSAMPLING))
 
     def close(self) -> None:
@@ -167,14 +176,24 @@ class SapienSimulator:
             self._eye_stage = self._make_stage(self._model.seen_by_eye)
         poses = self._world.poses()
         self._eye_stage.place(poses)
-        whole = EYE_HEIGHT / 2 / math.tan(math.radians(EYE_FOV_DEG / 2))
-        return self._eye_stage.picture(poses[EYE], width, height, whole * height / crop.height)
+        focal = (_EYE_FOCAL * width / crop.width, _EYE_FOCAL * height / crop.height)
+        return self._eye_stage.picture(poses[EYE], width, height, focal)
 
     def _make_stage(self, robot: tuple[Visual, ...]) -> Stage:
         stage = Stage(robot)
         if self._scene is not None:
             stage.set_boxes(self._scene.boxes)
         return stage
+
+
+def _built_robot() -> IcubModel:
+    try:
+        return build_icub()
+    except OSError as error:
+        raise UserError(
+            f"the robot's model cannot be built: {error}. Set VMDNN_CACHE to a folder that can be"
+            " written; if a file of icub-models is missing, install that package again."
+        ) from error
 
 
 def _before_sky(picture: Colours) -> Colours:

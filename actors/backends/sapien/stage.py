@@ -56,7 +56,9 @@ class Stage:
         for name, entity in self._boxes.items():
             entity.set_pose(poses[name])
 
-    def picture(self, eye: sapien.Pose, width: int, height: int, focal: float) -> Colours:
+    def picture(
+        self, eye: sapien.Pose, width: int, height: int, focal: tuple[float, float]
+    ) -> Colours:
         """Take a picture (height, width, 4) float32: sRGB colours in 0..1, and what is not sky.
 
         Where no body is seen, all four values are 0; elsewhere the last is 1.
@@ -65,11 +67,11 @@ class Stage:
             eye: x along the optical axis, y left, z up.
             width: pixels across.
             height: pixels down.
-            focal: focal length in these pixels.
+            focal: focal lengths in these pixels, across and down.
         """
         camera = self._camera(width, height)
         camera.entity.set_pose(eye)
-        camera.set_perspective_parameters(NEAR_M, FAR_M, focal, focal, width / 2, height / 2, 0.0)
+        camera.set_perspective_parameters(NEAR_M, FAR_M, *focal, width / 2, height / 2, 0.0)
         self._system.step()
         camera.take_picture()
         return np.asarray(camera.get_picture("Color"))
