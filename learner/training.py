@@ -305,4 +305,4 @@ def _arrays(tensors: Mapping[str, Tensor]) -> dict[str, NDArray[np.generic]]:
 
 
 def _tensors(arrays: Tensors) -> dict[str, Tensor]:
-    return {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return {name: torch.tensor(array) for name, array in arrays.items()}
