@@ -52,14 +52,14 @@ STANDING_POSTURE_DEG: Final[Mapping[str, float]] = {
 }
 _DECORATION: Final = ("l_", "r_hip", "r_upper_leg", "r_lower_leg", "r_ankle", "r_foot", "r_sole")
 
-# The network sees grey only. In linear luminance: hand 0.03 to 0.16, covers 0.09, and objects, an
+# The network sees grey only. In linear luminance: hand, wrist and covers 0.03 to 0.1; objects, an
 # obstacle and a table from 0.3 up. The official red of the covers would be an object's grey.
 _OFFICIAL_RED: Final = "0.635 0.137 0.114"
 _COVERS: Final[Colour] = (0.20, 0.03, 0.03)
 _BODY: Final[Colour] = (0.75, 0.75, 0.75)
 _EYEBALL: Final[Colour] = (0.95, 0.95, 0.95)
 _SHELL: Final[Colour] = (0.03, 0.03, 0.035)
-_METAL: Final[Colour] = (0.16, 0.16, 0.17)
+_METAL: Final[Colour] = (0.09, 0.09, 0.095)
 _TIP: Final[Colour] = (0.05, 0.05, 0.055)
 
 
@@ -148,7 +148,13 @@ def _official_parts(source: Tree, meshes: Path, links: Iterable[str]) -> Iterato
             scale = np.diag([*numbers(mesh.get("scale", "1 1 1")), 1.0])
             shape.apply_transform(origin_pose(visual) @ scale)
             rgba = find(find(visual, "material"), "color").get("rgba", "")
-            yield _Part(name, shape, _COVERS if rgba.startswith(_OFFICIAL_RED) else _BODY)
+            yield _Part(name, shape, _official_colour(name, rgba))
+
+
+def _official_colour(link: str, rgba: str) -> Colour:
+    if link == "r_wrist_1":
+        return _METAL
+    return _COVERS if rgba.startswith(_OFFICIAL_RED) else _BODY
 
 
 def _decoration_parts(source: Tree, meshes: Path) -> Iterator[_Part]:
