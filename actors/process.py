@@ -44,7 +44,9 @@ LOG = logging.getLogger(__name__)
 IDLE_S: Final = 0.3
 OUTBOX_PERIOD_S: Final = 1.0
 OUTBOX_LIMIT: Final = 100
-"""With so many episodes without a receipt it waits instead of playing on."""
+"""With so many episodes without a receipt it plays no more for whom they are."""
+PRACTICE_LIMIT: Final = 8
+"""With so many rollouts without a receipt it does not practise."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,9 @@ class ActorProcess:
         self._task = make_task(config.task)
         self._tutored = self._task.tutored()
         self._simulator = make_simulator(config.simulator)
-        self._outbox = Outbox(config.run_folder / "outbox" / bus.id, bus.deliver_wire)
+        outbox = config.run_folder / "outbox" / bus.id
+        self._sequences = Outbox(outbox / "sequences", bus.deliver_wire)
+        self._rollouts = Outbox(outbox / "rollouts", bus.deliver_wire)
         self._policy: NetworkPolicy | None = None
         self._policy_run = ""
         self._offered: PolicyVersion | None = None
@@ -116,7 +120,8 @@ class ActorProcess:
         try:
             with (
                 membership(self._bus, self, self._lifecycle),
-                every(OUTBOX_PERIOD_S, self._outbox.send_due),
+                every(OUTBOX_PERIOD_S, self._sequences.send_due),
+                every(OUTBOX_PERIOD_S, self._rollouts.send_due),
             ):
                 while not self._lifecycle.stopping:
                     self._play_next()
@@ -136,17 +141,21 @@ class ActorProcess:
             last_outcome=last.outcome.reason if last else None,
             last_kind=last.kind if last else None,
             backend=self._simulator.name,
-            outbox=len(self._outbox),
+            outbox=self._waiting,
             paused=self._lifecycle.paused,
         )
 
     def checkpoint(self) -> str:
         """Nothing is to be saved: finished episodes are on disk until their receipts come."""
-        return f"{len(self._outbox)} episodes wait for their receipts on disk"
+        return f"{self._waiting} episodes wait for their receipts on disk"
+
+    @property
+    def _waiting(self) -> int:
+        return len(self._sequences) + len(self._rollouts)
 
     def _play_next(self) -> None:
         assignment = None
-        if not self._lifecycle.paused and len(self._outbox) < OUTBOX_LIMIT:
+        if not self._lifecycle.paused:
             self._take_newest_policy()
             assignment = self._tutoring() or self._trial() or self._practice()
         if assignment is None:
@@ -162,6 +171,8 @@ class ActorProcess:
 
     def _tutoring(self) -> Assignment | None:
         """A case that the learner wants to be shown."""
+        if len(self._sequences) >= OUTBOX_LIMIT:
+            return None
         request = TutoringRequest(self._bus.id)
         for answer in self._bus.ask(self._bus.keys.request_tutoring, request, TutoringCase):
             if answer.case >= len(self._tutored):
@@ -173,7 +184,7 @@ class ActorProcess:
 
     def _trial(self) -> Assignment | None:
         """A trial of the policy at hand that the evaluator wants."""
-        if self._policy is None:
+        if self._policy is None or len(self._rollouts) >= OUTBOX_LIMIT:
             return None
         request = TrialRequest(self._bus.id, self._policy_run, self._policy.version)
         for trial in self._bus.ask(self._bus.keys.request_trial, request, Trial):
@@ -184,6 +195,8 @@ class ActorProcess:
     def _practice(self) -> Assignment | None:
         """A situation of its own choice."""
         if self._policy is None or not self._config.actor.practice:
+            return None
+        if len(self._rollouts) >= PRACTICE_LIMIT:
             return None
         seed = secrets.randbits(31)
         return Assignment(Kind.PRACTICE, self._policy, self._task.sample(seed), seed)
@@ -210,18 +223,19 @@ class ActorProcess:
         )
 
     def _send(self, episode: Episode) -> None:
-        tutoring = episode.kind is Kind.TUTORING
-        keys = self._bus.keys
-        key = keys.sequence(self._bus.id) if tutoring else keys.rollout(self._bus.id)
+        keys, actor = self._bus.keys, self._bus.id
         try:
-            wire = encode(Sequence(episode) if tutoring else Rollout(episode, self._policy_run))
+            if episode.kind is Kind.TUTORING:
+                self._sequences.add(episode.id, keys.sequence(actor), encode(Sequence(episode)))
+            else:
+                rollout = Rollout(episode, self._policy_run)
+                self._rollouts.add(episode.id, keys.rollout(actor), encode(rollout))
         except MessageError as error:  # such as a simulation that blew up into NaN
             LOG.warning("episode %s is dropped, nobody would take it: %s", episode.id, error)
-            return
-        self._outbox.add(episode.id, key, wire)
 
     def _on_receipt(self, receipt: Receipt) -> None:
-        self._outbox.received(receipt.episode)
+        self._sequences.received(receipt.episode)
+        self._rollouts.received(receipt.episode)
 
     def _on_policy(self, offered: PolicyVersion) -> None:
         with self._offering:

@@ -31,7 +31,7 @@ from proto.keys import Keys, Role
 
 LOG = logging.getLogger(__name__)
 
-CONNECT_WAIT_S: Final = 4.0
+CONNECT_WAIT_S: Final = 5.0
 """How long a starting process waits for the hub."""
 SHARED_MEMORY_FROM_BYTES: Final = 64 * 1024
 _SENDERS_REMEMBERED: Final = 1000

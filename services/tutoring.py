@@ -12,10 +12,9 @@ from proto.config import Config, load_config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.files import parts_in
+from proto.messages import TutoringCase
 from proto.recording import read_episode
 from services.playing import Job, play_all
-
-SEEDS_PER_CASE = 1000
 
 
 def parse_cases(text: str, count: int) -> list[int]:
@@ -44,7 +43,7 @@ def tutoring_jobs(config: Config, cases: Sequence[int], folder: Path) -> list[Jo
     return [
         Job(
             situation=situations[case],
-            seed=case * SEEDS_PER_CASE + repeat,
+            seed=TutoringCase(case, repeat).seed,
             kind=Kind.TUTORING,
             noisy=repeat > 0,
             record_to=folder / f"case{case:02d}_repeat{repeat:02d}.mcap",

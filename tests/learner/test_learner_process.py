@@ -208,7 +208,9 @@ def test_it_obeys_and_a_clean_stop_loses_no_epoch(school: School) -> None:
     assert tell_again.epoch >= last.epoch
 
 
-def test_the_last_epoch_gives_a_policy_and_then_it_rests(school: School) -> None:
+def test_the_last_epoch_gives_a_policy_that_another_network_does_not_overwrite(
+    school: School,
+) -> None:
     school.start("--set", "learner.epochs=8")
     school.show_all()
     told = school.tells(lambda told: told.stage is Stage.FINISHED)
@@ -217,12 +219,6 @@ def test_the_last_epoch_gives_a_policy_and_then_it_rests(school: School) -> None
     assert not told.done, "the configuration asks for three versions"
     assert stop(school.process) == 0
 
-
-def test_a_training_of_another_network_is_refused_and_kept(school: School) -> None:
-    school.start("--set", "learner.epochs=6")
-    school.show_all()
-    school.tells(lambda told: told.stage is Stage.FINISHED)
-    assert stop(school.process) == 0
     checkpoint = school.folder / "checkpoints" / "training.safetensors"
     before = checkpoint.read_bytes()
     ended = run_vmdnn("learner", *school.words, "--set", "network.pfc.units=7")

@@ -131,4 +131,4 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
     )
     recorded = {path.stem for path in (loop.folder / "rollouts").glob("*.mcap")}
     assert {trial["episode"] for trial in counted} <= recorded
-    assert list((loop.folder / "outbox").glob("*/*")) == []
+    assert list((loop.folder / "outbox").glob("*/*/*")) == []
