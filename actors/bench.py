@@ -23,18 +23,19 @@ from actors.process import Assignment, live_message
 from actors.simulator import Simulator, make_simulator
 from actors.tasks.registry import make_task
 from actors.tasks.task import Situation, Task
+from actors.tutor.plan import plan
 from learner.checkpoint import NETWORK_PREFIX, Checkpoint, CheckpointMetadata, CodeRanges
 from learner.policy import NetworkPolicy
 from learner.subnets import parameter_shapes
 from proto.action import ACTION_VALUES, FOCUS
 from proto.codec import encode
 from proto.config import Config, NetworkConfig
-from proto.episode import Episode, Floats, Image, Kind
+from proto.episode import Floats, Image, Kind
 from proto.messages import Rollout
 from proto.metrics import Stage
 
 ROUNDS: Final = 5
-LIMIT_S: Final = 20.0
+LIMIT_S: Final = 15.0
 """No further round begins after so long."""
 
 
@@ -67,8 +68,9 @@ def bench_actor(config: Config) -> ActorSpeed:
     """Measure an actor in less than half a minute.
 
     The whole loop is an episode as the actor's process plays it: observing, the network, judging,
-    recording, and encoding what goes to the bus. The bare loop repeats the same scene with the same
-    actions in the simulator alone. The two take turns, so that both meet the same machine.
+    recording, and encoding what goes to the bus. After each of its steps a second simulator does
+    the same with the same scene and action, and nothing else: the bare loop. Taking turns so often,
+    both meet the same machine, however busy it is.
 
     Raises:
         UserError: the simulator cannot run on this machine.
@@ -76,15 +78,19 @@ def bench_actor(config: Config) -> ActorSpeed:
     task = make_task(config.task)
     situation = task.tutored()[len(task.tutored()) // 2]
     tutor = make_tutor(config, noisy=False)
-    pupil = _Pupil(tutor, random_network(config.network))
+    pupil = _Pupil(random_network(config.network), plan(situation))
     rounds: list[_Round] = []
-    with closing(make_simulator(config.simulator)) as simulator:
-        _episode(simulator, task, tutor, situation)  # warms up
+    with (
+        closing(make_simulator(config.simulator)) as simulator,
+        closing(make_simulator(config.simulator)) as second,
+    ):
+        shadow = _Shadow(second, task)
         end = time.perf_counter() + LIMIT_S
+        _round(simulator, task, situation, tutor, pupil, shadow)  # warms up
         while len(rounds) < ROUNDS and (not rounds or time.perf_counter() < end):
-            rounds.append(_round(simulator, task, situation, tutor, pupil))
+            rounds.append(_round(simulator, task, situation, tutor, pupil, shadow))
         backend = simulator.name
-    steps = rounds[0].steps
+    steps = len(task.phases)
     return ActorSpeed(
         machine=_machine(),
         backend=backend,
@@ -92,14 +98,13 @@ def bench_actor(config: Config) -> ActorSpeed:
         render_ms=1e3 * median(r.render_s for r in rounds) / steps,
         network_ms=1e3 * median(r.network_s for r in rounds) / steps,
         steps_per_s=steps / median(r.whole_s for r in rounds),
-        ratio=median(r.whole_s for r in rounds) / median(r.bare_s for r in rounds),
+        ratio=median(r.whole_s / r.bare_s for r in rounds),
         episode_s=median(r.tutored_s for r in rounds),
     )
 
 
 @dataclass(frozen=True)
 class _Round:
-    steps: int
     whole_s: float
     network_s: float
     bare_s: float
@@ -122,29 +127,29 @@ class _Stopwatch:
 
 
 class _Pupil:
-    """Steps a network, but does as the tutor says: all of its work, and a real grasp."""
+    """Steps a network, but does as the tutor would: all of its work, and a real grasp."""
 
     name = "bench"
     version = 0
     looks = True
     target: NDArray[np.float64] | None = None
 
-    def __init__(self, tutor: Policy, network: NetworkPolicy) -> None:
-        self._tutor = tutor
-        self._network = network
+    def __init__(self, network: NetworkPolicy, actions: NDArray[np.float64]) -> None:
         self.outputs: Floats | None = None
         self.stopwatch = _Stopwatch()
+        self._network = network
+        self._actions = actions
 
     def begin(self, situation: Situation, seed: int) -> None:
-        self._tutor.begin(situation, seed)
         self._network.begin(situation, seed)
+        self._next = iter(self._actions)
         self.stopwatch = _Stopwatch()
 
     def step(self, image: Image) -> NDArray[np.float64]:
         with self.stopwatch:
             self._network.step(image)
         self.outputs = self._network.outputs
-        return self._tutor.step(image)
+        return next(self._next)
 
 
 def random_network(config: NetworkConfig) -> NetworkPolicy:
@@ -170,53 +175,73 @@ def random_network(config: NetworkConfig) -> NetworkPolicy:
     return NetworkPolicy(Checkpoint(metadata, tensors), "the network of the benchmark")
 
 
+class _Shadow:
+    """Plays in a simulator of its own what it is told, and measures that."""
+
+    def __init__(self, simulator: Simulator, task: Task) -> None:
+        self._simulator = simulator
+        self._task = task
+
+    def begin(self, situation: Situation) -> None:
+        """Start an episode."""
+        self.whole, self.physics, self.render = _Stopwatch(), _Stopwatch(), _Stopwatch()
+        self._focus = float(self._task.start[FOCUS])
+        with self.whole:
+            self._simulator.reset(self._task.scene(situation))
+
+    def follow(self, action: NDArray[np.float64]) -> None:
+        """Observe and run one control step."""
+        with self.whole:
+            with self.render:
+                self._simulator.observe(crop_of_focus(self._focus))
+            with self.physics:
+                self._simulator.step(targets_of_action(action))
+            self._focus = float(action[FOCUS])
+
+
 def _round(
-    simulator: Simulator, task: Task, situation: Situation, tutor: Policy, pupil: _Pupil
+    simulator: Simulator,
+    task: Task,
+    situation: Situation,
+    tutor: Policy,
+    pupil: _Pupil,
+    shadow: _Shadow,
 ) -> _Round:
-    whole, bare, physics, render, tutored = (_Stopwatch() for _ in range(5))
-    with whole:
-        episode = _episode(simulator, task, pupil, situation)
-    with bare:
-        _repeat(simulator, task, episode, physics, render)
+    both, tutored = _Stopwatch(), _Stopwatch()
+    with both:
+        shadow.begin(situation)
+        _play(simulator, task, pupil, situation, shadow)
     with tutored:
-        _episode(simulator, task, tutor, situation)
+        _play(simulator, task, tutor, situation)
     return _Round(
-        steps=episode.steps,
-        whole_s=whole.total_s,
+        whole_s=both.total_s - shadow.whole.total_s,
         network_s=pupil.stopwatch.total_s,
-        bare_s=bare.total_s,
-        physics_s=physics.total_s,
-        render_s=render.total_s,
+        bare_s=shadow.whole.total_s,
+        physics_s=shadow.physics.total_s,
+        render_s=shadow.render.total_s,
         tutored_s=tutored.total_s,
     )
 
 
-def _episode(simulator: Simulator, task: Task, policy: Policy, situation: Situation) -> Episode:
+def _play(
+    simulator: Simulator,
+    task: Task,
+    policy: Policy,
+    situation: Situation,
+    shadow: _Shadow | None = None,
+) -> None:
     """An episode as the actor's process plays it, but for the wire itself."""
     assignment = Assignment(Kind.TRIAL, policy, situation, seed=0)
 
     def on_step(live: LiveStep) -> None:
         encode(live_message("bench", assignment, live))
+        if shadow is not None:
+            shadow.follow(live.action)
 
     episode = play(
         simulator, task, policy, situation, seed=0, kind=assignment.kind, on_step=on_step
     )
     encode(Rollout(episode, "bench"))
-    return episode
-
-
-def _repeat(
-    simulator: Simulator, task: Task, episode: Episode, physics: _Stopwatch, render: _Stopwatch
-) -> None:
-    """The same scene and the same actions again, in the simulator alone."""
-    simulator.reset(task.scene(episode.situation))
-    focus = float(task.start[FOCUS])
-    for action in episode.actions:
-        with render:
-            simulator.observe(crop_of_focus(focus))
-        with physics:
-            simulator.step(targets_of_action(np.asarray(action, dtype=np.float64)))
-        focus = float(action[FOCUS])
 
 
 def _machine() -> str:

@@ -151,16 +151,23 @@ class Experiment1:
 
 @dataclass(frozen=True)
 class _Instant:
-    """What the judge keeps of one control step."""
+    """What the judge keeps of one control step; it must cost little, what follows from it may."""
 
     closing: float
-    height_m: float
+    touched: bool
+    body: Pose
+    hand: Pose
+
+
+@dataclass(frozen=True)
+class _Approach:
+    """How the hand came to the object."""
+
     moved_mm: float
     turned_deg: float
     yaw_error_deg: float
     along_mm: float
     across_mm: float
-    touched: bool
 
 
 class Experiment1Judge:
@@ -173,24 +180,12 @@ class Experiment1Judge:
 
     def watch(self, report: StepReport, joints_deg: Array, bodies: Mapping[str, Pose]) -> None:
         """Take note of one control step that has just been run."""
-        body = bodies["object"]
-        moved = np.subtract(body.position_m, self._start.position_m)
-        yaw = _yaw_deg(body)
-        axis, grasp_centre = _grasp(bodies[HAND])
-        centre = grasp_centre - body.position_m
-        turn = np.deg2rad(yaw)
         self._instants.append(
             _Instant(
                 closing=closing_fraction(joints_deg[9:]),
-                height_m=float(moved[2]),
-                moved_mm=1e3 * float(np.hypot(moved[0], moved[1])),
-                turned_deg=float(abs(_half_turn(yaw - _yaw_deg(self._start)))),
-                yaw_error_deg=float(
-                    abs(_half_turn(np.rad2deg(np.arctan2(axis[1], axis[0])) - yaw))
-                ),
-                along_mm=1e3 * float(-centre[0] * np.sin(turn) + centre[1] * np.cos(turn)),
-                across_mm=1e3 * float(centre[0] * np.cos(turn) + centre[1] * np.sin(turn)),
                 touched=any(box == "obstacle" for box, _ in report.touches),
+                body=bodies["object"],
+                hand=bodies[HAND],
             )
         )
 
@@ -199,10 +194,11 @@ class Experiment1Judge:
         instants = self._instants
         closed_at = self._closed_at()
         # The last instant at which the hand was still open tells how it came to the object.
-        before = instants[max(closed_at - 1, 0)] if closed_at >= 0 else instants[-1]
+        before = self._approach(instants[max(closed_at - 1, 0)] if closed_at >= 0 else instants[-1])
         touched_at = next((k for k, instant in enumerate(instants) if instant.touched), -1)
-        lenient = instants[-1].height_m > LIFTED_M
-        held = all(instant.height_m > LIFTED_M for instant in instants[-HELD_STEPS:])
+        lifted_m = [self._lifted_m(instant) for instant in instants[-HELD_STEPS:]]
+        lenient = lifted_m[-1] > LIFTED_M
+        held = min(lifted_m) > LIFTED_M
         unmoved = before.moved_mm <= MOVED_MM and before.turned_deg <= TURNED_DEG
         strict = held and unmoved and closed_at >= 0 and touched_at < 0
         right = (
@@ -222,7 +218,7 @@ class Experiment1Judge:
             strict=strict,
             precise=strict and right,
             reason=next((reason for failed, reason in failures if failed), Reason.NONE),
-            lifted_m=instants[-1].height_m,
+            lifted_m=lifted_m[-1],
             moved_mm=before.moved_mm,
             turned_deg=before.turned_deg,
             yaw_error_deg=before.yaw_error_deg,
@@ -230,6 +226,23 @@ class Experiment1Judge:
             across_mm=before.across_mm,
             closed_at=closed_at,
             obstacle_touched_at=touched_at,
+        )
+
+    def _lifted_m(self, instant: _Instant) -> float:
+        return instant.body.position_m[2] - self._start.position_m[2]
+
+    def _approach(self, instant: _Instant) -> _Approach:
+        moved = np.subtract(instant.body.position_m, self._start.position_m)
+        yaw = _yaw_deg(instant.body)
+        axis, grasp_centre = _grasp(instant.hand)
+        centre = grasp_centre - instant.body.position_m
+        turn = np.deg2rad(yaw)
+        return _Approach(
+            moved_mm=1e3 * float(np.hypot(moved[0], moved[1])),
+            turned_deg=float(abs(_half_turn(yaw - _yaw_deg(self._start)))),
+            yaw_error_deg=float(abs(_half_turn(np.rad2deg(np.arctan2(axis[1], axis[0])) - yaw))),
+            along_mm=1e3 * float(-centre[0] * np.sin(turn) + centre[1] * np.cos(turn)),
+            across_mm=1e3 * float(centre[0] * np.cos(turn) + centre[1] * np.sin(turn)),
         )
 
     def _closed_at(self) -> int:

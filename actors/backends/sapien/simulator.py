@@ -48,7 +48,6 @@ SKY: Final = 0.4
 """Grey of what lies beyond all bodies: lighter than the hand, darker than the table."""
 # Rec. 601 luma of red, green and blue; sky where the fourth value of `Stage.picture` is 0
 _GREY: Final = np.array([0.299, 0.587, 0.114, -SKY], dtype=np.float32)
-_STATIC_LINKS: Final = frozenset({"root_link", "torso_1", "torso_2", "chest"})
 
 
 class SapienSimulator:
@@ -75,7 +74,9 @@ class SapienSimulator:
         self._scene: Scene | None = None
         self._world_now: World | None = None
         self._targets_deg = np.zeros(18)
-        self._bodies: Mapping[str, Pose] | None = None  # asked for twice in a step
+        # Players ask for these before and after each step.
+        self._joints_deg: Array | None = None
+        self._bodies: Mapping[str, Pose] | None = None
 
     def reset(self, scene: Scene) -> None:
         """Replace whatever was there with `scene`; the same scene gives the same episode."""
@@ -88,7 +89,7 @@ class SapienSimulator:
             _angles_rad(self._targets_deg),
             self._config.physics_period_s,
         )
-        self._bodies = None
+        self._forget()
         for stage in (self._eye_stage, self._outside_stage):
             if stage is not None:
                 stage.set_boxes(scene.boxes)
@@ -110,7 +111,7 @@ class SapienSimulator:
             self._world.step()
             touches.update(self._world.touches())
         self._targets_deg = after
-        self._bodies = None
+        self._forget()
         return StepReport(frozenset(touches))
 
     def observe(self, crop: Crop) -> Observation:
@@ -123,23 +124,21 @@ class SapienSimulator:
 
     def joints_deg(self) -> Array:
         """Measured joint angles (18,) in degrees, without rendering."""
-        angles = np.rad2deg(self._world.joints_rad())
-        return np.concatenate([angles[:9], motors_from_joints(angles[9:])])
+        if self._joints_deg is None:
+            angles = np.rad2deg(self._world.joints_rad())
+            self._joints_deg = np.concatenate([angles[:9], motors_from_joints(angles[9:])])
+        return self._joints_deg.copy()
 
     def bodies(self) -> Mapping[str, Pose]:
         """True pose of every box and of every moving link of the robot, by name."""
         if self._bodies is None:
-            self._bodies = {
-                name: Pose(tuple(pose.p.tolist()), tuple(pose.q.tolist()))
-                for name, pose in self._world.poses().items()
-                if name not in _STATIC_LINKS
-            }
+            self._bodies = self._world.bodies()
         return self._bodies
 
     def show(self, joints_deg: Array, boxes: Mapping[str, Pose]) -> None:
         """Put a recorded state on the stage for pictures; not for use during an episode."""
         self._world.put(_angles_rad(joints_deg), boxes)
-        self._bodies = None
+        self._forget()
 
     def eye_picture(self, crop: Crop, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the left eye's crop."""
@@ -164,6 +163,10 @@ class SapienSimulator:
         if self._world_now is None:
             raise RuntimeError("reset(scene) must come before everything else")
         return self._world_now
+
+    def _forget(self) -> None:
+        """The robot or a box may have moved."""
+        self._joints_deg = self._bodies = None
 
     def _grey(self, crop: Crop) -> Image:
         """What the eye sees in a crop, averaged to (48, 64) uint8."""

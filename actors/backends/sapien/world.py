@@ -24,6 +24,7 @@ VELOCITY_ITERATIONS: Final = 1
 CONTACT_OFFSET_M: Final = 0.004
 
 _FINGER_LINKS: Final = frozenset(p.joint.removesuffix("_joint") for p in PHALANGES)
+_STATIC_LINKS: Final = frozenset({"root_link", "torso_1", "torso_2", "chest"})
 # Collision groups: whatever shares a bit of the third group does not touch. So the robot never
 # touches itself, and boxes touch everything.
 _ROBOT_GROUPS: Final = [1, 1, 1, 0]
@@ -129,6 +130,7 @@ class World:
         self._touchers |= {self._bodies[name]: name for name in moving}
         self._moving = {self._bodies[name] for name in moving}
         self._fingers = {link for name, link in self._links.items() if name in _FINGER_LINKS}
+        self._names = [entity.name for entity in self._scene.entities]
         self.put(start_rad, {})
         self.drive(start_rad)
 
@@ -173,9 +175,18 @@ class World:
             self._bodies[name].entity.set_pose(sapien.Pose(pose.position_m, pose.quaternion))
 
     def poses(self) -> dict[str, sapien.Pose]:
-        """Poses of all links and boxes, by name."""
+        """Poses of all links and boxes, by name, for drawing."""
         parts = self._links | self._bodies
         return {name: body.entity_pose for name, body in parts.items()}
+
+    def bodies(self) -> dict[str, Pose]:
+        """Poses of all links that can move and of all boxes, by name."""
+        rows = np.frombuffer(self._scene.pack_poses(), dtype=np.float32).reshape(-1, 7).tolist()
+        return {
+            name: Pose((x, y, z), (qw, qx, qy, qz))
+            for name, (qw, qx, qy, qz, x, y, z) in zip(self._names, rows, strict=True)
+            if name not in _STATIC_LINKS
+        }
 
 
 def _configure_physics() -> None:
