@@ -190,6 +190,8 @@ def test_a_policy_changes_between_episodes_only(
     theatre.publish(policy(3))
     eventually(lambda: acts_with(3), "it acts with policy 3")
     theatre.publish(policy(2))  # late: a version never goes back
+    seen_rollouts = len(theatre.rollouts)
+    eventually(lambda: len(theatre.rollouts) >= seen_rollouts + 2, "more episodes")
     theatre.publish(policy(1, run_id="new"))  # but a new training begins at 1
     eventually(lambda: any(r.run_id == "new" for r in theatre.rollouts), "the new training")
     theatre.actor.kill()

@@ -42,7 +42,8 @@ class Field:
         self.words = (
             *("--connect", self.endpoint, "--set", f"run.folder={folder}"),
             *("--set", "run.name=test", "--set", "evaluator.trials_per_policy=3"),
-            *("--set", "evaluator.seed=70", "--set", "done.trials=3"),
+            *("--set", "evaluator.seed=70", "--set", "evaluator.lease_s=1000"),
+            *("--set", "done.trials=3"),
             *("--set", "done.policy_versions=2"),
         )
         stack.enter_context(listening_hub(self.endpoint))
