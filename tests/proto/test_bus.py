@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 from collections.abc import Iterator
@@ -18,7 +19,16 @@ from proto.codec import encode
 from proto.config import HubConfig
 from proto.errors import UserError
 from proto.keys import Keys, Role
-from proto.messages import PolicyVersion, Receipt, TrialRequest, TutoringCase, TutoringRequest
+from proto.messages import (
+    Command,
+    Control,
+    ControlReply,
+    PolicyVersion,
+    Receipt,
+    TrialRequest,
+    TutoringCase,
+    TutoringRequest,
+)
 
 KEYS = Keys("test")
 
@@ -257,3 +267,38 @@ def test_a_hub_that_is_told_to_stop_ends_cleanly() -> None:
     with network() as net:
         net.join(Role.ACTOR, "actor")
         assert stop(net.hub) == 0
+
+
+def test_large_messages_go_through_shared_memory_too(shared: Network) -> None:
+    config = HubConfig(endpoint=shared.endpoint, shared_memory=True)
+    with (
+        open_bus(config, "test", Role.LEARNER, "near") as sender,
+        open_bus(config, "test", Role.ACTOR, "nearby") as reader,
+    ):
+        inbox = reader.inbox("vmdnn/test/near", PolicyVersion, capacity=5)
+        matched(sender, "vmdnn/test/near")
+        sender.deliver("vmdnn/test/near", policy(1))
+        assert inbox.take(timeout_s=10.0) == policy(1)
+
+
+def test_a_stranger_may_control_with_plain_json(shared: Network) -> None:
+    bus, stranger = shared.join(Role.RECORDER, "obedient"), shared.stranger()
+    heard: list[Control] = []
+
+    def obey(control: Control) -> ControlReply:
+        heard.append(control)
+        return ControlReply(Role.RECORDER, "obedient", "paused")
+
+    bus.answer(KEYS.control(Role.RECORDER), Control, obey)
+
+    def ask() -> list[str]:
+        replies = stranger.get(
+            KEYS.control(Role.RECORDER),
+            payload='{"command": "pause"}',
+            encoding="application/json;vmdnn.control.1",
+        )
+        return [reply.ok.payload.to_string() for reply in replies if reply.ok is not None]
+
+    eventually(lambda: ask() != [], "an answer")
+    assert json.loads(ask()[0]) == {"role": "recorder", "id": "obedient", "note": "paused"}
+    assert set(heard) == {Control(Command.PAUSE)}
