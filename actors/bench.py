@@ -41,7 +41,7 @@ LIMIT_S: Final = 15.0
 
 @dataclass(frozen=True)
 class ActorSpeed:
-    """What `bench_actor` measured; medians over its rounds.
+    """What `bench_actor` measured; medians, which other work on the machine disturbs least.
 
     Attributes:
         machine: processor and number of cores.
@@ -50,7 +50,7 @@ class ActorSpeed:
         render_ms: time of one observation, rendering and all.
         network_ms: time of one step of the network.
         steps_per_s: control steps per second of the actor's whole loop.
-        ratio: time of the whole loop over that of the bare simulator doing the same.
+        ratio: time of one step of the whole loop over that of the bare simulator doing the same.
         episode_s: time of one tutored episode.
     """
 
@@ -68,8 +68,8 @@ def bench_actor(config: Config) -> ActorSpeed:
     """Measure an actor in less than half a minute.
 
     The whole loop is an episode as the actor's process plays it: observing, the network, judging,
-    recording, and encoding what goes to the bus. After each of its steps a second simulator does
-    the same with the same scene and action, and nothing else: the bare loop. Taking turns so often,
+    recording, and encoding what goes to the bus. In each of its steps a second simulator does the
+    same with the same scene and action, and nothing else: the bare loop. Taking turns so often,
     both meet the same machine, however busy it is.
 
     Raises:
@@ -79,51 +79,40 @@ def bench_actor(config: Config) -> ActorSpeed:
     situation = task.tutored()[len(task.tutored()) // 2]
     tutor = make_tutor(config, noisy=False)
     pupil = _Pupil(random_network(config.network), plan(situation))
-    rounds: list[_Round] = []
+    tutored = _Laps()
     with (
         closing(make_simulator(config.simulator)) as simulator,
         closing(make_simulator(config.simulator)) as second,
     ):
+        _play(simulator, task, tutor, situation)  # warms up
         shadow = _Shadow(second, task)
         end = time.perf_counter() + LIMIT_S
-        _round(simulator, task, situation, tutor, pupil, shadow)  # warms up
-        while len(rounds) < ROUNDS and (not rounds or time.perf_counter() < end):
-            rounds.append(_round(simulator, task, situation, tutor, pupil, shadow))
+        while len(tutored) < ROUNDS and (not tutored or time.perf_counter() < end):
+            shadow.begin(situation)
+            _play(simulator, task, pupil, situation, shadow)
+            with tutored:
+                _play(simulator, task, tutor, situation)
         backend = simulator.name
-    steps = len(task.phases)
     return ActorSpeed(
         machine=_machine(),
         backend=backend,
-        physics_ms=1e3 * median(r.physics_s for r in rounds) / (steps * config.simulator.substeps),
-        render_ms=1e3 * median(r.render_s for r in rounds) / steps,
-        network_ms=1e3 * median(r.network_s for r in rounds) / steps,
-        steps_per_s=steps / median(r.whole_s for r in rounds),
-        ratio=median(r.whole_s / r.bare_s for r in rounds),
-        episode_s=median(r.tutored_s for r in rounds),
+        physics_ms=1e3 * median(shadow.physics) / config.simulator.substeps,
+        render_ms=1e3 * median(shadow.render),
+        network_ms=1e3 * median(pupil.network_laps),
+        steps_per_s=1.0 / median(shadow.whole_loop),
+        ratio=median(shadow.whole_loop) / median(shadow.bare_loop),
+        episode_s=median(tutored),
     )
 
 
-@dataclass(frozen=True)
-class _Round:
-    whole_s: float
-    network_s: float
-    bare_s: float
-    physics_s: float
-    render_s: float
-    tutored_s: float
-
-
-class _Stopwatch:
-    """Adds up how long `with` blocks take."""
-
-    def __init__(self) -> None:
-        self.total_s = 0.0
+class _Laps(list[float]):
+    """How long `with` blocks took, in seconds."""
 
     def __enter__(self) -> None:
         self._started = time.perf_counter()
 
     def __exit__(self, *_: object) -> None:
-        self.total_s += time.perf_counter() - self._started
+        self.append(time.perf_counter() - self._started)
 
 
 class _Pupil:
@@ -136,17 +125,16 @@ class _Pupil:
 
     def __init__(self, network: NetworkPolicy, actions: NDArray[np.float64]) -> None:
         self.outputs: Floats | None = None
-        self.stopwatch = _Stopwatch()
+        self.network_laps = _Laps()
         self._network = network
         self._actions = actions
 
     def begin(self, situation: Situation, seed: int) -> None:
         self._network.begin(situation, seed)
         self._next = iter(self._actions)
-        self.stopwatch = _Stopwatch()
 
     def step(self, image: Image) -> NDArray[np.float64]:
-        with self.stopwatch:
+        with self.network_laps:
             self._network.step(image)
         self.outputs = self._network.outputs
         return next(self._next)
@@ -176,51 +164,30 @@ def random_network(config: NetworkConfig) -> NetworkPolicy:
 
 
 class _Shadow:
-    """Plays in a simulator of its own what it is told, and measures that."""
+    """Does in a simulator of its own what another is told, step by step, and measures both."""
 
     def __init__(self, simulator: Simulator, task: Task) -> None:
+        self.whole_loop, self.bare_loop, self.render, self.physics = (_Laps() for _ in range(4))
         self._simulator = simulator
         self._task = task
 
     def begin(self, situation: Situation) -> None:
         """Start an episode."""
-        self.whole, self.physics, self.render = _Stopwatch(), _Stopwatch(), _Stopwatch()
+        self._simulator.reset(self._task.scene(situation))
         self._focus = float(self._task.start[FOCUS])
-        with self.whole:
-            self._simulator.reset(self._task.scene(situation))
+        self._followed_at: float | None = None
 
     def follow(self, action: NDArray[np.float64]) -> None:
-        """Observe and run one control step."""
-        with self.whole:
+        """Observe and run one control step; between two calls the other loop goes round once."""
+        if self._followed_at is not None:
+            self.whole_loop.append(time.perf_counter() - self._followed_at)
+        with self.bare_loop:
             with self.render:
                 self._simulator.observe(crop_of_focus(self._focus))
             with self.physics:
                 self._simulator.step(targets_of_action(action))
-            self._focus = float(action[FOCUS])
-
-
-def _round(
-    simulator: Simulator,
-    task: Task,
-    situation: Situation,
-    tutor: Policy,
-    pupil: _Pupil,
-    shadow: _Shadow,
-) -> _Round:
-    both, tutored = _Stopwatch(), _Stopwatch()
-    with both:
-        shadow.begin(situation)
-        _play(simulator, task, pupil, situation, shadow)
-    with tutored:
-        _play(simulator, task, tutor, situation)
-    return _Round(
-        whole_s=both.total_s - shadow.whole.total_s,
-        network_s=pupil.stopwatch.total_s,
-        bare_s=shadow.whole.total_s,
-        physics_s=shadow.physics.total_s,
-        render_s=shadow.render.total_s,
-        tutored_s=tutored.total_s,
-    )
+        self._focus = float(action[FOCUS])
+        self._followed_at = time.perf_counter()
 
 
 def _play(
