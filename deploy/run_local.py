@@ -78,15 +78,18 @@ def run(config: Config, actors: int, console: Console) -> None:
     started_s = time.monotonic()
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
-    file = config.run_folder / "config.yaml"
-    known = file.exists()
+    known = (config.run_folder / "config.yaml").exists()
+    logs = config.run_folder / "logs"
+    # The run's own config.yaml is the learner's to write, once it has seen that the run can go on
+    # with this one.
+    file = logs / "config.yaml"
     config.save(file)
     console.print(
         f"{'going on with' if known else 'starting'} run {config.run.name} with {actors} "
         f"{'actor' if actors == 1 else 'actors'} in {config.run_folder}",
         highlight=False,
     )
-    with Supervisor(programs(config, file, actors), config.run_folder / "logs") as supervisor:
+    with Supervisor(programs(config, file, actors), logs) as supervisor:
         supervisor.start("hub")
         with _connect(config, supervisor, lifecycle) as bus:
             for program in supervisor.programs[1:]:

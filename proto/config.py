@@ -12,6 +12,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from proto.errors import UserError
+from proto.files import written_whole
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -243,9 +244,13 @@ class Config(_Section):
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     def save(self, path: Path) -> None:
-        """Write the effective configuration as YAML."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False))
+        """Write the effective configuration as YAML.
+
+        Raises:
+            UserError: it cannot be written there.
+        """
+        with written_whole(path) as stream:
+            stream.write(yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False).encode())
 
 
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:

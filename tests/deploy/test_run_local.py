@@ -94,7 +94,17 @@ def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> N
     assert len(sequences) == 3
     assert len(list(run.glob("policies/*.safetensors"))) == 3
     assert len(list(run.glob("rollouts/*.mcap"))) >= 10
-    assert load_config(run / "config.yaml").run.name == "smoke"
+    config = load_config(run / "config.yaml")
+    assert config.run.name == "smoke"
+
+    # With another network the run cannot go on, and nothing of it is touched.
+    with started(tmp_path, "--set", "network.pfc.units=7") as process:
+        output, errors = process.communicate(timeout=120)
+        assert process.returncode == 2, output
+        assert "learner cannot go on" in errors
+        assert not processes_that_name(str(tmp_path))
+    assert load_config(run / "config.yaml") == config
+    assert len(list(run.glob("policies/*.safetensors"))) == 3
 
 
 def test_a_process_that_is_given_bad_input_ends_the_run_and_says_why(tmp_path: Path) -> None:
@@ -128,6 +138,15 @@ def test_a_missing_config_starts_nothing(
     assert main(["--config", str(missing), "--set", f"run.folder={tmp_path / 'runs'}"]) == 2
     assert str(missing) in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_written_starts_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    settings = [f"run.folder={tmp_path / 'file'}", f"hub.endpoint={free_endpoint()}"]
+    assert main([word for setting in settings for word in ("--set", setting)]) == 2
+    assert "cannot be written" in capsys.readouterr().err
 
 
 def test_a_port_in_use_starts_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
