@@ -1,0 +1,91 @@
+"""A config is checked whole, a bad one is explained, and what is saved is read back the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from proto.config import Config, RunConfig, load_config
+from proto.errors import UserError
+from services.cli import main
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "config.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("learner: {ratee: 1}", "learner.ratee"),
+        ("teacher: {rate: 1}", "teacher"),
+        ("learner: {rate: fast}", "learner.rate"),
+        ("learner: {rate: .nan}", "learner.rate"),
+        ("learner: {epochs: 0}", "learner.epochs"),
+        ("run: {name: ../elsewhere}", "run.name"),
+        ("simulator: {control_period_s: 0.1, physics_period_s: 0.03}", "whole multiple"),
+        ("done: {trials: 53}", "done.trials"),
+        ("hub: {endpoint: 'localhost:7447'}", "hub.endpoint"),
+        ("- a list", "expected `section: ...` lines"),
+        ("learner: {rate", "cannot be read"),
+    ],
+)
+def test_what_is_wrong_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+) -> None:
+    path = written(tmp_path, text)
+    assert main(["doctor", "--config", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert str(path) in error
+
+
+def test_a_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = tmp_path / "none.yaml"
+    assert main(["doctor", "--config", str(missing)]) == 2
+    assert f"{missing} does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("override", ["learner.rate", "=1", "learner.rate.more=1", "run={"])
+def test_an_override_that_cannot_be_applied_is_named(tmp_path: Path, override: str) -> None:
+    with pytest.raises(UserError) as error:
+        load_config(written(tmp_path, "learner: {rate: 0.1}"), [override])
+    assert override in str(error.value)
+
+
+def test_an_override_wins_over_the_file(tmp_path: Path) -> None:
+    path = written(tmp_path, "learner: {rate: 0.1, threads: 2}")
+    learner = load_config(path, ["learner.rate=0.2", "learner.rate=0.3"]).learner
+    assert (learner.rate, learner.threads) == (0.3, 2)
+
+
+@given(
+    rate=st.floats(1e-9, 1e9),
+    seed=st.integers(0, 2**32 - 1),
+    cases=st.none() | st.lists(st.integers(0, 44), min_size=1).map(tuple),
+)
+def test_what_is_saved_is_read_back_the_same(
+    tmp_path_factory: pytest.TempPathFactory,
+    rate: float,
+    seed: int,
+    cases: tuple[int, ...] | None,
+) -> None:
+    config = Config.model_validate(
+        {"run": {"seed": seed}, "learner": {"rate": rate, "cases": cases}}
+    )
+    path = tmp_path_factory.mktemp("saved") / "config.yaml"
+    config.save(path)
+    again = load_config(path)
+    assert again == config
+    assert again.digest() == config.digest()
+
+
+def test_the_digest_tells_what_matters_from_what_does_not() -> None:
+    digest = Config().digest()
+    assert Config(run=RunConfig(folder=Path("elsewhere"))).digest() == digest
+    assert Config(run=RunConfig(seed=2)).digest() != digest
