@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
+import cv2
 import numpy as np
 
 from actors.backends.sapien.graphics import require_graphics
-from actors.backends.sapien.stage import Colours, Stage, looking_at
+from actors.backends.sapien.stage import Picture, Stage, looking_at
 from actors.backends.sapien.world import RobotBuilder, World
 from actors.simulator import (
     EYE_HEIGHT,
@@ -44,10 +45,10 @@ OUTSIDE_POSE: Final = looking_at((-0.7, 1.0, 0.55), (0.09, 0.12, 0.11))
 """From the robot's left front, a little above it (world frame, m)."""
 OUTSIDE_FOV_DEG: Final = 52.0
 OUTSIDE_SUPERSAMPLING: Final = 2
-SKY: Final = 0.4
+SKY: Final = 102.0
 """Grey of what lies beyond all bodies: lighter than the hand, darker than the table."""
 # Rec. 601 luma of red, green and blue; sky where the fourth value of `Stage.picture` is 0
-_GREY: Final = np.array([0.299, 0.587, 0.114, -SKY], dtype=np.float32)
+_GREY: Final = np.array([0.299, 0.587, 0.114, -SKY / 255.0], dtype=np.float32)
 
 
 class SapienSimulator:
@@ -142,7 +143,7 @@ class SapienSimulator:
 
     def eye_picture(self, crop: Crop, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the left eye's crop."""
-        return _bytes(_before_sky(self._look(crop, width, height)))
+        return _before_sky(self._look(crop, width, height))
 
     def outside_picture(self, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the scene from outside, full meshes."""
@@ -152,7 +153,7 @@ class SapienSimulator:
         size = (OUTSIDE_SUPERSAMPLING * width, OUTSIDE_SUPERSAMPLING * height)
         focal = _focal(OUTSIDE_FOV_DEG, size[1])
         fine = self._outside_stage.picture(OUTSIDE_POSE, *size, (focal, focal))
-        return _bytes(_averaged(_before_sky(fine), OUTSIDE_SUPERSAMPLING))
+        return _before_sky(_averaged(fine, OUTSIDE_SUPERSAMPLING))
 
     def close(self) -> None:
         """Free what the simulator holds."""
@@ -171,9 +172,10 @@ class SapienSimulator:
     def _grey(self, crop: Crop) -> Image:
         """What the eye sees in a crop, averaged to (48, 64) uint8."""
         size = (SUPERSAMPLING * IMAGE_WIDTH, SUPERSAMPLING * IMAGE_HEIGHT)
-        return _bytes(_averaged(self._look(crop, *size) @ _GREY + SKY, SUPERSAMPLING))
+        picture = _averaged(self._look(crop, *size), SUPERSAMPLING)
+        return np.asarray(np.rint(picture @ _GREY + SKY), dtype=np.uint8)
 
-    def _look(self, crop: Crop, width: int, height: int) -> Colours:
+    def _look(self, crop: Crop, width: int, height: int) -> Picture:
         """What the eye sees in a crop, (height, width, 4) as in `Stage.picture`."""
         if self._eye_stage is None:
             self._eye_stage = self._make_stage(self._model.seen_by_eye)
@@ -199,21 +201,16 @@ def _built_robot() -> IcubModel:
         ) from error
 
 
-def _before_sky(picture: Colours) -> Colours:
+def _before_sky(picture: Picture) -> Image:
     """Colours (height, width, 3) of a picture (height, width, 4) of bodies alone."""
-    return np.asarray(picture[..., :3] + SKY * (1.0 - picture[..., 3:]), dtype=np.float32)
+    sky = SKY * (1.0 - picture[..., 3:] / 255.0)
+    return np.asarray(np.rint(picture[..., :3] + sky), dtype=np.uint8)
 
 
-def _averaged(fine: Colours, factor: int) -> Colours:
+def _averaged(fine: Picture, factor: int) -> Picture:
     """Mean over blocks of factor x factor pixels."""
-    height, width = fine.shape[0] // factor, fine.shape[1] // factor
-    blocks = fine.reshape(height, factor, width, factor, *fine.shape[2:])
-    return np.asarray(blocks.mean(axis=(1, 3)), dtype=np.float32)
-
-
-def _bytes(values: Colours) -> Image:
-    """0..1 to 0..255."""
-    return np.asarray(np.rint(255.0 * values), dtype=np.uint8)
+    size = (fine.shape[1] // factor, fine.shape[0] // factor)
+    return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _black() -> Image:

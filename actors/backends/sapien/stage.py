@@ -20,7 +20,7 @@ from sapien import render
 from actors.simulator import Box
 from sim_assets.icub_visuals import Visual
 
-Colours = NDArray[np.float32]
+Picture = NDArray[np.uint8]
 
 # Mesa's software renderer otherwise starts a thread for each core, and actors fight for them.
 os.environ.setdefault("LP_NUM_THREADS", "0")
@@ -34,6 +34,7 @@ class Stage:
     """Bodies made of shapes under a light that never changes (see `shader/`)."""
 
     def __init__(self, robot: Iterable[Visual]) -> None:
+        render.set_picture_format("Color", "r8g8b8a8unorm")  # a quarter of the usual floats
         self._system = render.RenderSystem()
         self._scene = sapien.Scene([self._system])
         shapes: dict[str, list[Any]] = {}
@@ -58,10 +59,10 @@ class Stage:
 
     def picture(
         self, eye: sapien.Pose, width: int, height: int, focal: tuple[float, float]
-    ) -> Colours:
-        """Take a picture (height, width, 4) float32: sRGB colours in 0..1, and what is not sky.
+    ) -> Picture:
+        """Take a picture (height, width, 4) uint8: sRGB colours, and what is not sky.
 
-        Where no body is seen, all four values are 0; elsewhere the last is 1.
+        Where no body is seen, all four values are 0; elsewhere the last is 255.
 
         Args:
             eye: x along the optical axis, y left, z up.
