@@ -7,15 +7,14 @@ sequence is computed once, when the sequence comes in.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.utils.rnn import pad_sequence
 
-from learner.loss import kl_divergence
+from learner.divergence import divergence
+from learner.sequences import Sequences
 from learner.softmax_code import SoftmaxCode
 from learner.vision_input import vision_input
 from learner.vmdnn import VMDNN
@@ -23,21 +22,6 @@ from proto.action import ACTION_NAMES
 from proto.episode import Episode, Floats
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class _Stacked:
-    """All sequences, filled up to the longest.
-
-    Attributes:
-        seen: (S, T, V_S units) activity of V_S.
-        codes: (S, T, 11, softmax units) the teacher's outputs.
-        mask: (S, T) one where a sequence has a step.
-    """
-
-    seen: Tensor
-    codes: Tensor
-    mask: Tensor
 
 
 class CoupledTraining:
@@ -55,7 +39,7 @@ class CoupledTraining:
         self._seen: list[Tensor] = []
         self._codes: list[Tensor] = []
         self._targets: list[Floats] = []
-        self._stack: _Stacked | None = None
+        self._sequences: Sequences | None = None
 
     def __len__(self) -> int:
         return len(self._seen)
@@ -68,13 +52,13 @@ class CoupledTraining:
             self._seen.append(self._network.see(images[None])[0])
         self._codes.append(torch.from_numpy(self.code.encode(episode.targets)))
         self._targets.append(episode.targets)
-        self._stack = None
+        self._sequences = None
 
     def loss(self, chosen: Tensor) -> Tensor:
         """Mean divergence of eq. (5), for the sequences with these indices."""
-        stack = self._stacked()
-        log_outputs = self._network.act(stack.seen[chosen])
-        return kl_divergence(log_outputs, stack.codes[chosen], stack.mask[chosen])
+        if self._sequences is None:
+            self._sequences = Sequences.stacked(self._seen, self._codes)
+        return divergence(self._network, self._sequences, chosen)
 
     def mean_errors(self) -> NDArray[np.float64]:
         """(11,) mean distance of the decoded outputs from the targets, over all sequences."""
@@ -84,16 +68,6 @@ class CoupledTraining:
                 outputs = self._network.act(seen[None])[0].exp().numpy()
                 errors.append(np.abs(self.code.decode(outputs) - targets))
         return np.asarray(np.concatenate(errors).mean(0))
-
-    def _stacked(self) -> _Stacked:
-        if self._stack is None:
-            masks = [torch.ones(len(seen)) for seen in self._seen]
-            self._stack = _Stacked(
-                pad_sequence(self._seen, batch_first=True),
-                pad_sequence(self._codes, batch_first=True),
-                pad_sequence(masks, batch_first=True),
-            )
-        return self._stack
 
     def _warn_outside(self, episode: Episode) -> None:
         excess = np.maximum(self.code.minima - episode.targets, episode.targets - self.code.maxima)

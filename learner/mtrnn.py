@@ -43,11 +43,14 @@ class Level(nn.Module):
             self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
 
 
-def run_levels(levels: Sequence[Level], below: Tensor, order: UpdateOrder) -> Tensor:
+def run_levels(
+    levels: Sequence[Level], below: Tensor, order: UpdateOrder, initial: Tensor | None = None
+) -> Tensor:
     """Activity (B, T, units) of the last level for the activity (B, T, F) below the first.
 
     Bottom-up, a level sees the activity below it of the same step, and feedback and recurrence of
-    the step before. Literally, by eq. (1), everything is of the step before.
+    the step before. Literally, by eq. (1), everything is of the step before. `initial` (B, units
+    of all levels) are the potentials before the first step; without it they are at rest.
     """
     first = levels[0]
     if order == "literal":
@@ -56,13 +59,15 @@ def run_levels(levels: Sequence[Level], below: Tensor, order: UpdateOrder) -> Te
     leaks = torch.cat([drive.new_full((level.units,), 1 / level.tau) for level in levels])
     delayed = _delayed_weights(levels, with_input=order == "literal")
     immediate = [level.input for level in levels[1:]] if order == "bottom_up" else []
-    activity = recurrent_scan(drive, leaks, delayed, immediate)
+    first_potentials = None if initial is None else initial.T
+    activity = recurrent_scan(drive, leaks, delayed, immediate, first_potentials)
     return activity[:, -levels[-1].units :].permute(2, 0, 1)
 
 
-def one_step_later(activity: Tensor) -> Tensor:
-    """Activity (B, T, F) as it was one step before, at rest before the first."""
-    return torch.cat([torch.zeros_like(activity[:, :1]), activity[:, :-1]], dim=1)
+def one_step_later(activity: Tensor, before: Tensor | None = None) -> Tensor:
+    """Activity (B, T, F) as it was one step before; `before` (B, F) the first, else at rest."""
+    first = torch.zeros_like(activity[:, 0]) if before is None else before
+    return torch.cat([first[:, None], activity[:, :-1]], dim=1)
 
 
 def _drive(levels: Sequence[Level], seen: Tensor) -> Tensor:
@@ -88,9 +93,13 @@ def _delayed_weights(levels: Sequence[Level], *, with_input: bool) -> Tensor:
 
 
 def recurrent_scan(
-    drive: Tensor, leaks: Tensor, delayed: Tensor, immediate: Sequence[Tensor]
+    drive: Tensor,
+    leaks: Tensor,
+    delayed: Tensor,
+    immediate: Sequence[Tensor],
+    initial: Tensor | None = None,
 ) -> Tensor:
-    """Run leaky integrators through time, from rest.
+    """Run leaky integrators through time.
 
     u[t] = (1 - leaks) u[t-1] + leaks (drive[t] + delayed y[t-1] + immediate y[t]), y[t] = f(u[t]).
     Units are stacked level on level. This is where training spends its time.
@@ -101,9 +110,10 @@ def recurrent_scan(
         delayed: (N, N) weights of the activity one step before, to x from.
         immediate: weights of each level but the first on the level before it, within the step;
             empty when nothing acts within a step.
+        initial: (N, B) potentials u before the first step; without it they are at rest, zero.
 
     Returns:
-        Activity (T, N, B), differentiable by drive, delayed and immediate.
+        Activity (T, N, B), differentiable by drive, delayed, immediate and initial.
     """
     # With h = tanh(v) and v = slope u a step needs no factors: y = gain h.
     scale = (ACTIVATION_SLOPE * leaks)[:, None]
@@ -111,9 +121,17 @@ def recurrent_scan(
     scaled = [
         ACTIVATION_GAIN * scale[span] * block for span, block in zip(spans, immediate, strict=True)
     ]
+    if initial is None:
+        initial = torch.zeros_like(drive[0])
     hidden = cast(
         "Tensor",
-        _Scan.apply(scale * drive, 1 - leaks, ACTIVATION_GAIN * scale * delayed, *scaled),  # type: ignore[no-untyped-call]
+        _Scan.apply(  # type: ignore[no-untyped-call]
+            scale * drive,
+            1 - leaks,
+            ACTIVATION_SLOPE * initial,
+            ACTIVATION_GAIN * scale * delayed,
+            *scaled,
+        ),
     )
     return ACTIVATION_GAIN * hidden
 
@@ -130,14 +148,19 @@ class _Scan(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: FunctionCtx, drive: Tensor, keep: Tensor, delayed: Tensor, *immediate: Tensor
+        ctx: FunctionCtx,
+        drive: Tensor,
+        keep: Tensor,
+        initial: Tensor,
+        delayed: Tensor,
+        *immediate: Tensor,
     ) -> Tensor:
         steps, units, batch = drive.shape
         spans = _spans(delayed, immediate)
         keep = keep[:, None]
         hidden = drive.new_empty(steps, units, batch)
-        before = drive.new_zeros(units, batch)
-        potential = drive.new_zeros(units, batch)
+        potential = initial
+        rest = before = torch.tanh(initial)
         for t in range(steps):
             now = hidden[t]
             potential = torch.addcmul(drive[t], potential, keep).addmm_(delayed, before)
@@ -146,13 +169,13 @@ class _Scan(torch.autograd.Function):
                 part = potential[span].addmm_(weights, now[below])
                 torch.tanh(part, out=now[span])
             before = now
-        ctx.save_for_backward(hidden, keep, delayed, *immediate)
+        ctx.save_for_backward(hidden, rest, keep, delayed, *immediate)
         return hidden
 
     @staticmethod
     def backward(ctx: FunctionCtx, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (by_hidden,) = gradients
-        hidden, keep, delayed, *immediate = ctx.saved_tensors  # type: ignore[attr-defined]
+        hidden, rest, keep, delayed, *immediate = ctx.saved_tensors  # type: ignore[attr-defined]
         spans = _spans(delayed, immediate)
         slopes = torch.addcmul(hidden.new_ones(()), hidden, hidden, value=-1)
         # deltas[t] = dE/dv[t]: eq. (6), with the paths inside a step added.
@@ -170,11 +193,12 @@ class _Scan(torch.autograd.Function):
                     by_now[span].addmm_(immediate_back[level], now[spans[level + 1]])
                 torch.addcmul(kept[span], slopes[t, span], by_now[span], out=now[span])
             after = now
-        by_delayed = _sum_of_products(deltas[1:], hidden[:-1])
+        by_initial = after * keep + (1 - rest * rest) * (delayed_back @ after)
+        by_delayed = torch.addmm(_sum_of_products(deltas[1:], hidden[:-1]), deltas[0], rest.T)
         by_immediate = [
             _sum_of_products(deltas[:, span], hidden[:, below]) for below, span in pairwise(spans)
         ]
-        return deltas, None, by_delayed, *by_immediate
+        return deltas, None, by_initial, by_delayed, *by_immediate
 
 
 def _sum_of_products(deltas: Tensor, sources: Tensor) -> Tensor:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from learner.mstnn import Maps
+from learner.mstnn import Maps, activation
 from learner.mtrnn import Level, one_step_later, run_levels
 from learner.subnets import Subnet, subnets
 from proto.config import NetworkConfig
@@ -67,15 +69,31 @@ class VMDNN(nn.Module):
         slow: Tensor = self.mstnn_slow(fast)
         return slow.flatten(2)
 
-    def act(self, seen: Tensor) -> Tensor:
-        """Logarithms of the outputs (B, T, 11, softmax units) for V_S (B, T, units)."""
+    def act(self, seen: Tensor, initial: Tensor | None = None) -> Tensor:
+        """Logarithms of the outputs (B, T, 11, softmax units) for V_S (B, T, units).
+
+        `initial` (B, units of PFC, M_S and M_F) are the potentials before the first step, by
+        default zero, the neutral state.
+        """
         order = self.config.update_order
-        levels = (self.pfc, self.mtrnn_slow, self.mtrnn_fast)
-        fast = run_levels(levels, seen, order)
+        fast = run_levels(self.levels(), seen, order, initial)
         if order == "literal":
-            fast = one_step_later(fast)
+            before = None if initial is None else activation(initial[:, -fast.shape[-1] :])
+            fast = one_step_later(fast, before)
         outputs: Tensor = self.outputs(fast)
         return outputs
+
+    def levels(self) -> tuple[Level, Level, Level]:
+        """PFC, M_S and M_F."""
+        return self.pfc, self.mtrnn_slow, self.mtrnn_fast
+
+    def core_parameters(self) -> list[nn.Parameter]:
+        """Parameters of PFC, M_S, M_F and M_O, in the order in which the kernels have them."""
+        parameters = []
+        for level in self.levels():
+            parameters += [level.input, level.recurrent, level.feedback, level.bias]
+        parameters += [self.outputs.input, self.outputs.bias]
+        return [cast("nn.Parameter", each) for each in parameters if each is not None]
 
     def vision(self) -> tuple[Maps, Maps]:
         """The subnets that pre-training forms and coupled training leaves alone."""
@@ -83,7 +101,7 @@ class VMDNN(nn.Module):
 
     def coupled_parameters(self) -> list[nn.Parameter]:
         """What coupled training changes: everything but the vision (section 3.3)."""
-        coupled = (self.pfc, self.mtrnn_slow, self.mtrnn_fast, self.outputs)
+        coupled = (*self.levels(), self.outputs)
         return [parameter for module in coupled for parameter in module.parameters()]
 
     def initialize(

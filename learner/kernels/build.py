@@ -1,0 +1,96 @@
+"""Compile the C++ kernel with the machine's own compiler.
+
+The library is compiled when the package is installed, else at its first use. Its name holds a
+digest of the source, the flags and the processor, so that what was compiled for another processor
+or from an older source is never loaded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Final
+
+SOURCE: Final = Path(__file__).with_name("core.cpp")
+FLAGS: Final = (
+    "-std=c++17",
+    "-O3",
+    "-march=native",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-fPIC",
+    "-shared",
+    "-pthread",
+)
+_COMPILERS: Final = ("c++", "g++", "clang++")
+
+
+class NotCompiledError(Exception):
+    """There is no library, for the reason that the message gives."""
+
+
+def find_or_compile() -> Path:
+    """The library for this machine: beside the source, in the cache, or freshly compiled there.
+
+    Raises:
+        NotCompiledError: there is no compiler, or it failed.
+    """
+    for folder in (SOURCE.parent, cache_folder()):
+        library = folder / library_name()
+        if library.is_file():
+            return library
+    return compile_into(cache_folder())
+
+
+def cache_folder() -> Path:
+    """`$VMDNN_CACHE`, or `~/.cache/vmdnn`."""
+    return Path(os.environ.get("VMDNN_CACHE") or Path.home() / ".cache" / "vmdnn")
+
+
+def library_name() -> str:
+    """File name of the library for this source and this processor."""
+    parts = (SOURCE.read_text(), " ".join(FLAGS), _processor())
+    return f"core-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()[:16]}.so"
+
+
+def compile_into(folder: Path) -> Path:
+    """Compile the library into a folder, where it appears only when it is whole.
+
+    Raises:
+        NotCompiledError: there is no compiler, or it failed.
+    """
+    compiler = _compiler()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            library = Path(scratch) / library_name()
+            command = [compiler, *FLAGS, str(SOURCE), "-o", str(library)]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode != 0:
+                raise NotCompiledError(f"{' '.join(command)} failed:\n{done.stderr.strip()}")
+            return library.replace(folder / library.name)
+    except OSError as error:
+        raise NotCompiledError(f"it cannot be compiled into {folder}: {error}") from error
+
+
+def _compiler() -> str:
+    for name in filter(None, (os.environ.get("CXX"), *_COMPILERS)):
+        found = shutil.which(name)
+        if found is not None:
+            return found
+    raise NotCompiledError(f"there is no C++ compiler ({', '.join(_COMPILERS)})")
+
+
+def _processor() -> str:
+    """What -march=native depends on."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return f"{platform.machine()} {platform.processor()}"
+    telling = ("model name", "flags", "Features", "CPU part")
+    return "\n".join(sorted({line for line in lines if line.startswith(telling)}))

@@ -1,0 +1,1118 @@
+// The recurrent core PFC > M_S > M_F > M_O, forward and backward through whole sequences.
+//
+// Given the activity of V_S and the teacher's outputs, one call computes the Kullback-Leibler
+// divergence of eq. (5) and its gradients: those of the paper's eq. (6), with the paths inside a
+// step added. `learner.mtrnn` and `learner.vmdnn` say the same in PyTorch; `learner.kernels.cpu`
+// calls this.
+//
+// How it is fast:
+// - Sequences are grouped, one sequence a vector lane. An array "of vectors" below holds one value
+//   of each sequence of a group. Products of weights and states then need no sums across lanes,
+//   and only the connections that exist are computed.
+// - Every product sums a tile of results in registers.
+// - Only the two scans are bound to the order of steps. All else is cut into chunks of steps that
+//   threads share, and a chunk's intermediate results stay in cache.
+// - Each piece of work writes sums of its own, added up in a fixed order at the end. So results do
+//   not depend on which thread did what.
+//
+// With h = tanh(v), v = slope u and y = gain h a step needs no factors: gain, slope and 1 / tau go
+// into the packed weights, and into the gradients at the end.
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+#include <cstring>
+#include <mutex>
+#include <new>
+#include <numeric>
+#include <thread>
+#include <utility>
+#include <vector>
+
+#ifdef __linux__
+#include <sys/mman.h>
+#endif
+
+namespace {
+
+constexpr double kGain = 1.7159;  // eq. (2)
+constexpr double kSlope = 2.0 / 3.0;
+
+#if defined(__AVX512F__)
+constexpr int kVectorBytes = 64;
+#elif defined(__AVX__)
+constexpr int kVectorBytes = 32;
+#else
+constexpr int kVectorBytes = 16;
+#endif
+
+constexpr int kTile = 10;   // results of a product in registers; units are padded to a multiple
+constexpr int kSide = 5;    // a tile of a weight gradient is kSide x kSide
+constexpr int kWide = 3;    // vectors of inputs in a tile of the gradient of the input weights
+constexpr int kChunk = 32;  // steps that are worked on together where their order does not matter
+
+// ---------------------------------------------------------------------------------------------
+// Vectors
+
+template <typename Real>
+struct Simd {
+  static constexpr int kLanes = kVectorBytes / int(sizeof(Real));
+  typedef Real Vector __attribute__((vector_size(kVectorBytes)));
+};
+
+template <typename Real>
+using Vector = typename Simd<Real>::Vector;
+
+template <typename Real>
+inline Vector<Real> load(const Real* from) {
+  Vector<Real> vector;
+  std::memcpy(&vector, from, sizeof vector);
+  return vector;
+}
+
+template <typename Real>
+inline void store(Real* to, const Vector<Real>& vector) {
+  std::memcpy(to, &vector, sizeof vector);
+}
+
+// The 2 x 2 blocks of size kStep in (a; b), transposed: a keeps its first and gets b's first.
+template <int kStep, typename Vec, int... kLane>
+inline void exchange(Vec& a, Vec& b, std::integer_sequence<int, kLane...>) {
+  constexpr int kLanes = sizeof...(kLane);
+  const Vec first = __builtin_shufflevector(
+      a, b, (kLane & kStep ? kLanes + kLane - kStep : kLane)...);
+  const Vec second = __builtin_shufflevector(
+      a, b, (kLane & kStep ? kLanes + kLane : kLane + kStep)...);
+  a = first;
+  b = second;
+}
+
+template <typename Real, int kStep>
+inline void transpose_from(Vector<Real>* square) {
+  constexpr int kLanes = Simd<Real>::kLanes;
+  if constexpr (kStep < kLanes) {
+#pragma GCC unroll 16
+    for (int row = 0; row < kLanes; ++row) {
+      if ((row & kStep) == 0) {
+        exchange<kStep>(square[row], square[row + kStep],
+                        std::make_integer_sequence<int, kLanes>());
+      }
+    }
+    transpose_from<Real, 2 * kStep>(square);
+  }
+}
+
+// Lane j of vector i becomes lane i of vector j.
+template <typename Real>
+inline void transpose(Vector<Real>* square) {
+  transpose_from<Real, 1>(square);
+}
+
+// Lane i of the result is the sum of the lanes of vector i. The vectors are used up.
+template <typename Real, int kStep = 1>
+inline Vector<Real> sums_of_lanes(Vector<Real>* square) {
+  constexpr int kLanes = Simd<Real>::kLanes;
+  if constexpr (kStep == kLanes) {
+    return square[0];
+  } else {
+#pragma GCC unroll 16
+    for (int row = 0; row < kLanes; row += 2 * kStep) {
+      exchange<kStep>(square[row], square[row + kStep], std::make_integer_sequence<int, kLanes>());
+      square[row] += square[row + kStep];
+    }
+    return sums_of_lanes<Real, 2 * kStep>(square);
+  }
+}
+
+// Arrays of `count` values, one array a lane, as an array of `count` vectors.
+template <typename Real>
+inline void gather(const Real* const* arrays, int count, Vector<Real>* vectors) {
+  constexpr int kLanes = Simd<Real>::kLanes;
+  if (count < kLanes) {
+    for (int i = 0; i < count; ++i) {
+      for (int lane = 0; lane < kLanes; ++lane) vectors[i][lane] = arrays[lane][i];
+    }
+    return;
+  }
+  for (int next = 0; next < count; next += kLanes) {
+    const int start = std::min(next, count - kLanes);  // the last block may overlap the one before
+    Vector<Real> square[kLanes];
+#pragma GCC unroll 16
+    for (int lane = 0; lane < kLanes; ++lane) square[lane] = load(arrays[lane] + start);
+    transpose<Real>(square);
+#pragma GCC unroll 16
+    for (int i = 0; i < kLanes; ++i) vectors[start + i] = square[i];
+  }
+}
+
+// The converse: array `lane` begins at arrays + lane * pitch and has room for whole vectors.
+template <typename Real>
+inline void scatter(const Vector<Real>* vectors, int count, Real* arrays, std::ptrdiff_t pitch) {
+  constexpr int kLanes = Simd<Real>::kLanes;
+  for (int start = 0; start < count; start += kLanes) {
+    Vector<Real> square[kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+      square[i] = start + i < count ? vectors[start + i] : Vector<Real>{};
+    }
+    transpose<Real>(square);
+    for (int lane = 0; lane < kLanes; ++lane) store(arrays + lane * pitch + start, square[lane]);
+  }
+}
+
+// ---------------------------------------------------------------------------------------------
+// Functions of vectors. The float versions are minimax fits with errors below 4e-7 relative.
+
+template <typename Vec, typename... Real>
+inline Vec polynomial(const Vec& x, double highest, Real... lower) {
+  Vec result = Vec{} + decltype(x[0] + x[0])(highest);
+  ((result = result * x + decltype(x[0] + x[0])(lower)), ...);
+  return result;
+}
+
+template <typename Function>
+inline Vector<double> each_lane(Vector<double> x, Function function) {
+  for (int lane = 0; lane < Simd<double>::kLanes; ++lane) x[lane] = function(x[lane]);
+  return x;
+}
+
+inline Vector<double> tanh_of(const Vector<double>& x) {
+  return each_lane(x, [](double value) { return std::tanh(value); });
+}
+
+inline Vector<double> exp_of(const Vector<double>& x) {
+  return each_lane(x, [](double value) { return std::exp(value); });
+}
+
+inline Vector<double> log_of(const Vector<double>& x) {
+  return each_lane(x, [](double value) { return std::log(value); });
+}
+
+inline Vector<float> tanh_of(const Vector<float>& argument) {
+  constexpr float kFlat = 9;  // from here on the nearest float is 1
+  Vector<float> x = argument < kFlat ? argument : Vector<float>{} + kFlat;
+  x = x > -kFlat ? x : Vector<float>{} - kFlat;
+  const Vector<float> square = x * x;
+  const Vector<float> above = polynomial(square, 1.335340532e-08, 2.060817859e-05, 3.495534134e-03,
+                                         1.338098080e-01, 9.999999796e-01);
+  const Vector<float> below = polynomial(square, 7.776043805e-07, 3.285545684e-04, 2.587677853e-02,
+                                         4.671429646e-01, 1.0);
+  return x * above / below;
+}
+
+typedef std::int32_t Integers __attribute__((vector_size(kVectorBytes)));
+
+// For x <= 0.
+inline Vector<float> exp_of(const Vector<float>& argument) {
+  constexpr float kRound = 12582912;  // 1.5 * 2^23: adding it rounds to an integer
+  const Vector<float> x = argument > -87.0f ? argument : Vector<float>{} - 87.0f;
+  const Vector<float> rounded = x * 1.44269504f + kRound;
+  const Vector<float> twos = rounded - kRound;
+  const Vector<float> rest = (x - twos * 0.693359375f) + twos * 2.12194440e-4f;  // ln 2 in 2 parts
+  const Vector<float> power =
+      polynomial(rest, 1.383684192e-03, 8.374815782e-03, 4.166822564e-02, 1.666642017e-01,
+                 4.999999208e-01, 1.000000036e+00, 1.000000001e+00);
+  return Vector<float>(Integers(power) + (Integers(rounded) << 23));
+}
+
+// For normal x > 0.
+inline Vector<float> log_of(const Vector<float>& x) {
+  constexpr std::int32_t kRootHalf = 0x3f3504f3;  // bits of sqrt(1/2)
+  const Integers twos = (Integers(x) - kRootHalf) >> 23;
+  const Vector<float> part = Vector<float>(Integers(x) - (twos << 23)) - 1.0f;
+  const Vector<float> quotient = polynomial(
+      part, 8.722243253e-02, -1.436678817e-01, 1.495228303e-01, -1.656240195e-01, 1.995683282e-01,
+      -2.500207365e-01, 3.333418564e-01, -4.999998797e-01, 9.999999742e-01);
+  return part * quotient + __builtin_convertvector(twos, Vector<float>) * 0.693147181f;
+}
+
+template <typename Vec>
+inline Vec larger(const Vec& a, const Vec& b) {
+  return a > b ? a : b;
+}
+
+// ---------------------------------------------------------------------------------------------
+// Products
+
+// sums[i] += sum over k of weights[k][i] x[k], for one tile of packed weights.
+template <typename Real>
+inline void add_product(const Real* weights, int columns, const Vector<Real>* x,
+                        Vector<Real>* sums) {
+  for (int k = 0; k < columns; ++k, weights += kTile) {
+    const Vector<Real> factor = x[k];
+#pragma GCC unroll 10
+    for (int i = 0; i < kTile; ++i) sums[i] += weights[i] * factor;
+  }
+}
+
+// sums[i][j] (+)= sum over steps and lanes of left[step][i] right[step][j].
+// Adds to `sums` (rows x columns), whose sizes are multiples of kSide.
+template <typename Real>
+void add_outer_products(const Vector<Real>* left, int left_pitch, int rows,
+                        const Vector<Real>* right, int right_pitch, int columns, int steps,
+                        Real* sums) {
+  constexpr int kLanes = Simd<Real>::kLanes;
+  constexpr int kPadded = (kSide * kSide + kLanes - 1) / kLanes * kLanes;
+  for (int row = 0; row < rows; row += kSide) {
+    for (int column = 0; column < columns; column += kSide) {
+      Vector<Real> tile[kPadded] = {};
+      const Vector<Real>* a = left + row;
+      const Vector<Real>* b = right + column;
+      for (int step = 0; step < steps; ++step, a += left_pitch, b += right_pitch) {
+#pragma GCC unroll 5
+        for (int i = 0; i < kSide; ++i) {
+#pragma GCC unroll 5
+          for (int j = 0; j < kSide; ++j) tile[i * kSide + j] += a[i] * b[j];
+        }
+      }
+      Real results[kPadded];
+      for (int start = 0; start < kPadded; start += kLanes) {
+        store(results + start, sums_of_lanes<Real>(tile + start));
+      }
+      for (int i = 0; i < kSide; ++i) {
+        Real* sum = sums + std::ptrdiff_t(row + i) * columns + column;
+        for (int j = 0; j < kSide; ++j) sum[j] += results[i * kSide + j];
+      }
+    }
+  }
+}
+
+// sums[i] += sum over steps and lanes of vectors[step][i].
+template <typename Real>
+void add_totals(const Vector<Real>* vectors, int pitch, int rows, int steps, Real* sums) {
+  for (int row = 0; row < rows; ++row) {
+    Vector<Real> total{};
+    for (int step = 0; step < steps; ++step) total += vectors[std::ptrdiff_t(step) * pitch + row];
+    for (int lane = 0; lane < Simd<Real>::kLanes; ++lane) sums[row] += total[lane];
+  }
+}
+
+// sums[i][f] += sum over steps of left[step][i] right[step][f], where a vector holds neighbouring f.
+// kVectors of them are done, for kSide values of i.
+template <typename Real, int kVectors>
+inline void add_rank_products(const Real* left, int left_pitch, const Real* right, int pitch,
+                              int steps, Real* sums) {
+  constexpr int kLanes = Simd<Real>::kLanes;
+  Vector<Real> tile[kSide][kVectors];
+#pragma GCC unroll 5
+  for (int i = 0; i < kSide; ++i) {
+#pragma GCC unroll 4
+    for (int v = 0; v < kVectors; ++v) {
+      tile[i][v] = load(sums + std::ptrdiff_t(i) * pitch + v * kLanes);
+    }
+  }
+  for (int step = 0; step < steps; ++step, left += left_pitch, right += pitch) {
+    Vector<Real> factor[kVectors];
+#pragma GCC unroll 4
+    for (int v = 0; v < kVectors; ++v) factor[v] = load(right + v * kLanes);
+#pragma GCC unroll 5
+    for (int i = 0; i < kSide; ++i) {
+#pragma GCC unroll 4
+      for (int v = 0; v < kVectors; ++v) tile[i][v] += left[i] * factor[v];
+    }
+  }
+#pragma GCC unroll 5
+  for (int i = 0; i < kSide; ++i) {
+#pragma GCC unroll 4
+    for (int v = 0; v < kVectors; ++v) {
+      store(sums + std::ptrdiff_t(i) * pitch + v * kLanes, tile[i][v]);
+    }
+  }
+}
+
+// ---------------------------------------------------------------------------------------------
+// Memory that a thread keeps from call to call: fresh pages would cost more than the arithmetic.
+
+class Arena {
+ public:
+  ~Arena() { std::free(memory_); }
+
+  // From here until `reserve`, what `take` gives is only counted.
+  void measure() { used_ = 0; }
+
+  // From here on `take` gives what was counted, and all that was taken before is lost.
+  void reserve() {
+    const std::size_t bytes = used_;
+    used_ = 0;
+    if (bytes <= size_) return;
+    std::free(memory_);
+    size_ = (bytes + kPage - 1) / kPage * kPage;
+    memory_ = static_cast<char*>(std::aligned_alloc(kPage, size_));
+    if (memory_ == nullptr) {
+      size_ = 0;
+      throw std::bad_alloc();
+    }
+#ifdef __linux__
+    madvise(memory_, size_, MADV_HUGEPAGE);
+#endif
+  }
+
+  template <typename Value>
+  Value* take(std::size_t count) {
+    const auto address = reinterpret_cast<std::uintptr_t>(memory_) + used_;
+    used_ += (count * sizeof(Value) + kLine - 1) / kLine * kLine;
+    return reinterpret_cast<Value*>(address);
+  }
+
+ private:
+  static constexpr std::size_t kLine = 64;
+  static constexpr std::size_t kPage = std::size_t(1) << 21;
+  char* memory_ = nullptr;
+  std::size_t size_ = 0;
+  std::size_t used_ = 0;
+};
+
+// ---------------------------------------------------------------------------------------------
+// What is asked for
+
+template <typename Real>
+struct Problem {
+  std::int32_t levels;         // PFC, M_S, M_F
+  std::int32_t inputs;         // units of V_S
+  std::int32_t values;         // of an action
+  std::int32_t softmax_units;  // of each value
+  std::int32_t literal;        // whether every connection takes a step, as in eq. (1)
+  std::int32_t sequences;      // B
+  std::int32_t steps;          // T
+  std::int32_t threads;
+  const std::int32_t* units;     // (levels,)
+  const double* leaks;           // (levels,) 1 / tau
+  const std::int64_t* chosen;    // (B,) which of the S sequences
+  const Real* seen;              // (S, T, inputs)
+  const Real* targets;           // (S, T, values * softmax units), each value's sum is one
+  const Real* target_entropies;  // (S, T) sum of targets * log(targets)
+  const Real* mask;              // (S, T)
+  const Real* initial;           // (B, all units) potentials before the first step; null: zero
+  // Of each level: input, recurrent, feedback (but the last), bias; of the outputs: input, bias.
+  const Real* parameters;
+  double* divergence;
+  Real* by_parameters;  // null: only the divergence is asked for
+  Real* by_drive;       // (B, T, units of the PFC) by what V_S brings to the PFC, or null
+  Real* by_initial;     // (B, all units), or null
+};
+
+struct Level {
+  int units;
+  int padded;   // to a multiple of kTile
+  int start;    // of its padded units among those of all levels
+  int first;    // of its units among those of all levels
+  double keep;  // 1 - 1 / tau
+  double scale;  // slope / tau
+};
+
+inline int padded_to_tiles(int units) { return (units + kTile - 1) / kTile * kTile; }
+
+// scale times a (rows x columns) matrix of the given pitches, in tiles of kTile rows: tile by tile,
+// column by column, filled up with zeros to whole tiles and `padded` columns.
+template <typename Real>
+void pack(Real* packed, const Real* matrix, int row_pitch, int column_pitch, int rows, int columns,
+          int padded, Real scale) {
+  for (int tile = 0; tile < rows; tile += kTile) {
+    for (int column = 0; column < padded; ++column) {
+      for (int row = tile; row < tile + kTile; ++row) {
+        const bool exists = row < rows && column < columns;
+        *packed++ = exists ? scale * matrix[std::ptrdiff_t(row) * row_pitch +
+                                            std::ptrdiff_t(column) * column_pitch]
+                           : Real(0);
+      }
+    }
+  }
+}
+
+// to (rows x columns) += scale times a matrix with this pitch.
+template <typename Real>
+void add_scaled(const Real* matrix, int pitch, int rows, int columns, Real scale, Real* to) {
+  for (int row = 0; row < rows; ++row, matrix += pitch, to += columns) {
+    for (int column = 0; column < columns; ++column) to[column] += scale * matrix[column];
+  }
+}
+
+// Weights from one level to another, or from M_F to M_O.
+template <typename Real>
+struct Connection {
+  int to;
+  int from;
+  bool delayed;               // whether it takes a step
+  std::ptrdiff_t parameters;  // where its (to.units, from.units) weights lie among all parameters
+  std::ptrdiff_t sums;        // where its gradient lies among a group's sums, with padded sizes
+  Real scale;                 // packed over given weights
+  Real* forward;              // packed, rows `to`
+  Real* backward;             // packed, rows `from`
+};
+
+enum Stage { kProject, kForward, kOutputs, kBackward, kInputs, kDone };
+
+template <typename Real>
+class Pass {
+ public:
+  Pass(const Problem<Real>& problem, Arena& arena);
+  void run();
+
+ private:
+  using Vec = Vector<Real>;
+  static constexpr int kLanes = Simd<Real>::kLanes;
+
+  // kLanes sequences and what is computed of them. Row t + 1 of hidden and deltas is step t, row 0
+  // is the state before the first step.
+  struct Group {
+    int members;
+    int steps;                // of the longest
+    int member[kLanes];       // which of the B
+    std::int64_t row[kLanes];  // first of its T rows among the S * T; lanes left over repeat one
+    Vec* hidden;              // (steps + 1, width)
+    Vec* deltas;              // (steps + 2, width) by v; first by h of M_F
+    Real* sums;               // gradients of what the backward scan does
+    Real* output_sums;        // (chunks, ...)
+    Real* input_sums;         // (chunks, ...)
+    double* divergences;      // (chunks,)
+    Stage stage;
+    int next;        // chunk of this stage that is not yet taken
+    int unfinished;  // chunks of this stage
+  };
+
+  struct Scratch {
+    Vec* inputs;      // (inputs,)
+    Vec* potentials;  // (width,) or (outputs,)
+    Vec* targets;     // (outputs,)
+    Vec* deltas;      // (kChunk, outputs)
+    Real* rows;       // (lanes, kChunk, pitch)
+  };
+
+  struct Task {
+    Group* group;
+    Stage stage;
+    int chunk;
+  };
+
+  bool wants_gradients() const { return problem_.by_parameters != nullptr; }
+  int chunks(const Group& group) const { return (group.steps + kChunk - 1) / kChunk; }
+  int chunks(const Group& group, Stage stage) const {
+    return stage == kForward || stage == kBackward ? 1 : chunks(group);
+  }
+  int row_pitch() const { return (levels_[0].padded + kLanes - 1) / kLanes * kLanes; }
+  std::ptrdiff_t output_sums() const {
+    return std::ptrdiff_t(outputs_) * (levels_.back().padded + 1);
+  }
+  std::ptrdiff_t input_sums() const {
+    return std::ptrdiff_t(levels_[0].padded) * problem_.inputs;
+  }
+
+  void describe();
+  void connect(int to, int from, bool delayed, std::ptrdiff_t& next);
+  void form_groups();
+  void take_memory(Arena& arena);
+  void pack_weights();
+  void pack_connection(Connection<Real>& connection, int to, int to_padded, const Level& from);
+  void work(const Scratch& scratch);
+  bool claim(Task& task);
+  void finish(const Task& task);
+  void project(const Group& group, int chunk, const Scratch& scratch) const;
+  void scan_forward(Group& group, const Scratch& scratch) const;
+  void start_rows(Group& group, Vec* potentials) const;
+  void outputs(const Group& group, int chunk, const Scratch& scratch) const;
+  Vec softmax(const Vec* potentials, const Vec* targets, Vec* deltas, const Vec& weight) const;
+  void scan_backward(Group& group) const;
+  void step_backward(Group& group, int row) const;
+  void sum_gradients(const Group& group, int first, int end) const;
+  void give_initial(const Group& group) const;
+  void give_drive(const Group& group) const;
+  void inputs(const Group& group, int chunk, const Scratch& scratch) const;
+  void add_up() const;
+
+  const Problem<Real>& problem_;
+  const int lag_;      // steps that an input connection takes
+  const int outputs_;  // units of M_O, padded
+  int width_ = 0;      // units of all levels, padded
+  int units_ = 0;      // units of all levels
+  std::vector<Level> levels_;
+  std::vector<std::ptrdiff_t> biases_;         // of the levels, among all parameters
+  std::vector<Connection<Real>> connections_;  // between levels
+  Connection<Real> to_outputs_{};
+  std::ptrdiff_t output_bias_ = 0;  // among all parameters
+  std::ptrdiff_t group_sums_ = 0;   // gradients of the connections, then of the levels' biases
+  double weight_ = 0;               // of one value of one step in the mean
+  std::vector<Group> groups_;
+  std::vector<Scratch> scratch_;
+  Real* packed_bias_ = nullptr;         // (width,)
+  Real* packed_output_bias_ = nullptr;  // (outputs,)
+  Real* packed_inputs_ = nullptr;
+  std::mutex mutex_;
+};
+
+// --- what there is to do ---
+
+template <typename Real>
+Pass<Real>::Pass(const Problem<Real>& problem, Arena& arena)
+    : problem_(problem),
+      lag_(problem.literal ? 1 : 0),
+      outputs_(padded_to_tiles(problem.values * problem.softmax_units)) {
+  describe();
+  form_groups();
+  arena.measure();
+  take_memory(arena);
+  arena.reserve();
+  take_memory(arena);
+  pack_weights();
+}
+
+template <typename Real>
+void Pass<Real>::describe() {
+  const int last = problem_.levels - 1;
+  for (int l = 0; l <= last; ++l) {
+    const double leak = problem_.leaks[l];
+    const int units = problem_.units[l];
+    levels_.push_back({units, padded_to_tiles(units), width_, units_, 1 - leak, kSlope * leak});
+    width_ += levels_.back().padded;
+    units_ += units;
+  }
+  std::ptrdiff_t next = 0;  // among the parameters
+  for (int l = 0; l <= last; ++l) {
+    const int units = levels_[l].units;
+    if (l == 0) {
+      next += std::ptrdiff_t(units) * problem_.inputs;
+    } else {
+      connect(l, l - 1, problem_.literal != 0, next);
+    }
+    connect(l, l, true, next);
+    if (l < last) connect(l, l + 1, true, next);
+    biases_.push_back(next);
+    next += units;
+  }
+  const std::ptrdiff_t outputs = problem_.values * problem_.softmax_units;
+  to_outputs_.parameters = next;
+  to_outputs_.scale = Real(kGain);
+  output_bias_ = next + outputs * levels_[last].units;
+  group_sums_ += width_;
+}
+
+// Counts the connection's weights, which begin at `next` among the parameters.
+template <typename Real>
+void Pass<Real>::connect(int to, int from, bool delayed, std::ptrdiff_t& next) {
+  Connection<Real> connection{};
+  connection.to = to;
+  connection.from = from;
+  connection.delayed = delayed;
+  connection.parameters = next;
+  connection.scale = Real(kGain * levels_[to].scale);
+  connection.sums = group_sums_;
+  connections_.push_back(connection);
+  next += std::ptrdiff_t(levels_[to].units) * levels_[from].units;
+  group_sums_ += std::ptrdiff_t(levels_[to].padded) * levels_[from].padded;
+}
+
+// Sequences of like length go together, the longest first.
+template <typename Real>
+void Pass<Real>::form_groups() {
+  const int count = problem_.sequences;
+  std::vector<int> lengths(count);
+  double weight = 0;
+  for (int b = 0; b < count; ++b) {
+    const Real* mask = problem_.mask + problem_.chosen[b] * problem_.steps;
+    for (int t = 0; t < problem_.steps; ++t) {
+      weight += mask[t];
+      if (mask[t] != 0) lengths[b] = t + 1;
+    }
+  }
+  weight_ = 1 / (weight * problem_.values);
+  std::vector<int> order(count);
+  std::iota(order.begin(), order.end(), 0);
+  std::stable_sort(order.begin(), order.end(),
+                   [&](int a, int b) { return lengths[a] > lengths[b]; });
+  for (int begin = 0; begin < count; begin += kLanes) {
+    Group group{};
+    group.members = std::min(kLanes, count - begin);
+    group.steps = std::max(1, lengths[order[begin]]);
+    for (int lane = 0; lane < kLanes; ++lane) {
+      group.member[lane] = order[begin + std::min(lane, group.members - 1)];
+      group.row[lane] = problem_.chosen[group.member[lane]] * problem_.steps;
+    }
+    group.unfinished = chunks(group, kProject);
+    groups_.push_back(group);
+  }
+}
+
+template <typename Real>
+void Pass<Real>::take_memory(Arena& arena) {
+  const Level& first = levels_.front();
+  const Level& last = levels_.back();
+  for (Connection<Real>& connection : connections_) {
+    const std::size_t size =
+        std::size_t(levels_[connection.to].padded) * levels_[connection.from].padded;
+    connection.forward = arena.take<Real>(size);
+    connection.backward = arena.take<Real>(size);
+  }
+  to_outputs_.forward = arena.take<Real>(std::size_t(outputs_) * last.padded);
+  to_outputs_.backward = arena.take<Real>(std::size_t(outputs_) * last.padded);
+  packed_bias_ = arena.take<Real>(width_);
+  packed_output_bias_ = arena.take<Real>(outputs_);
+  packed_inputs_ = arena.take<Real>(std::size_t(first.padded) * problem_.inputs);
+  for (Group& group : groups_) {
+    group.hidden = arena.take<Vec>(std::size_t(group.steps + 1) * width_);
+    group.divergences = arena.take<double>(chunks(group));
+    if (!wants_gradients()) continue;
+    group.deltas = arena.take<Vec>(std::size_t(group.steps + 2) * width_);
+    group.sums = arena.take<Real>(group_sums_);
+    group.output_sums = arena.take<Real>(chunks(group) * output_sums());
+    group.input_sums = arena.take<Real>(chunks(group) * input_sums());
+  }
+  scratch_.resize(problem_.threads);
+  for (Scratch& scratch : scratch_) {
+    scratch.inputs = arena.take<Vec>(problem_.inputs);
+    scratch.potentials = arena.take<Vec>(std::max(width_, outputs_));
+    scratch.targets = arena.take<Vec>(outputs_);
+    scratch.deltas = arena.take<Vec>(std::size_t(kChunk) * outputs_);
+    scratch.rows = arena.take<Real>(std::size_t(kLanes) * kChunk * row_pitch());
+  }
+}
+
+template <typename Real>
+void Pass<Real>::pack_weights() {
+  for (Connection<Real>& connection : connections_) {
+    pack_connection(connection, levels_[connection.to].units, levels_[connection.to].padded,
+                    levels_[connection.from]);
+  }
+  const int outputs = problem_.values * problem_.softmax_units;
+  pack_connection(to_outputs_, outputs, outputs_, levels_.back());
+  for (std::size_t l = 0; l < levels_.size(); ++l) {
+    const Real* bias = problem_.parameters + biases_[l];
+    for (int i = 0; i < levels_[l].padded; ++i) {
+      packed_bias_[levels_[l].start + i] =
+          i < levels_[l].units ? Real(levels_[l].scale) * bias[i] : Real(0);
+    }
+  }
+  for (int i = 0; i < outputs_; ++i) {
+    packed_output_bias_[i] = i < outputs ? problem_.parameters[output_bias_ + i] : Real(0);
+  }
+  const Level& first = levels_.front();
+  pack(packed_inputs_, problem_.parameters, problem_.inputs, 1, first.units, problem_.inputs,
+       problem_.inputs, Real(first.scale));
+}
+
+template <typename Real>
+void Pass<Real>::pack_connection(Connection<Real>& connection, int to, int to_padded,
+                                 const Level& from) {
+  const Real* weights = problem_.parameters + connection.parameters;
+  pack(connection.forward, weights, from.units, 1, to, from.units, from.padded, connection.scale);
+  pack(connection.backward, weights, 1, from.units, from.units, to, to_padded, connection.scale);
+}
+
+// --- who does it ---
+
+template <typename Real>
+void Pass<Real>::run() {
+  std::vector<std::thread> helpers;
+  for (int i = 1; i < problem_.threads; ++i) {
+    helpers.emplace_back([this, i] { work(scratch_[i]); });
+  }
+  work(scratch_[0]);
+  for (std::thread& helper : helpers) helper.join();
+  add_up();
+}
+
+template <typename Real>
+void Pass<Real>::work(const Scratch& scratch) {
+  Task task;
+  while (claim(task)) {
+    switch (task.stage) {
+      case kProject: project(*task.group, task.chunk, scratch); break;
+      case kForward: scan_forward(*task.group, scratch); break;
+      case kOutputs: outputs(*task.group, task.chunk, scratch); break;
+      case kBackward: scan_backward(*task.group); break;
+      case kInputs: inputs(*task.group, task.chunk, scratch); break;
+      case kDone: break;
+    }
+    finish(task);
+  }
+}
+
+// The next piece of work, or false when all is done. The first group that can go on does, so that
+// the groups' scans, which only one thread can do, begin early.
+template <typename Real>
+bool Pass<Real>::claim(Task& task) {
+  for (bool done = false; !done; std::this_thread::yield()) {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    done = true;
+    for (Group& group : groups_) {
+      if (group.stage == kDone) continue;
+      done = false;
+      if (group.next < chunks(group, group.stage)) {
+        task = {&group, group.stage, group.next++};
+        return true;
+      }
+    }
+  }
+  return false;
+}
+
+template <typename Real>
+void Pass<Real>::finish(const Task& task) {
+  const std::lock_guard<std::mutex> lock(mutex_);
+  Group& group = *task.group;
+  if (--group.unfinished > 0) return;
+  group.stage = group.stage == kOutputs && !wants_gradients() ? kDone : Stage(group.stage + 1);
+  group.next = 0;
+  group.unfinished = chunks(group, group.stage);
+}
+
+// --- forward ---
+
+// What the PFC gets from V_S, and its biases, into its rows of `hidden`.
+template <typename Real>
+void Pass<Real>::project(const Group& group, int chunk, const Scratch& scratch) const {
+  const Level& pfc = levels_.front();
+  const int end = std::min((chunk + 1) * kChunk, group.steps);
+  for (int t = chunk * kChunk; t < end; ++t) {
+    Vec* drive = group.hidden + std::ptrdiff_t(t + 1) * width_;
+    const bool sees = t >= lag_;
+    if (sees) {
+      const Real* arrays[kLanes];
+      for (int lane = 0; lane < kLanes; ++lane) {
+        arrays[lane] = problem_.seen + (group.row[lane] + t - lag_) * problem_.inputs;
+      }
+      gather(arrays, problem_.inputs, scratch.inputs);
+    }
+    for (int tile = 0; tile < pfc.padded; tile += kTile) {
+      Vec sums[kTile];
+      for (int i = 0; i < kTile; ++i) sums[i] = Vec{} + packed_bias_[tile + i];
+      if (sees) {
+        add_product<Real>(packed_inputs_ + std::ptrdiff_t(tile) * problem_.inputs, problem_.inputs,
+                          scratch.inputs, sums);
+      }
+      for (int i = 0; i < kTile; ++i) drive[tile + i] = sums[i];
+    }
+  }
+}
+
+template <typename Real>
+void Pass<Real>::scan_forward(Group& group, const Scratch& scratch) const {
+  Vec* potentials = scratch.potentials;
+  start_rows(group, potentials);
+  for (int row = 1; row <= group.steps; ++row) {
+    Vec* now = group.hidden + std::ptrdiff_t(row) * width_;
+    const Vec* before = now - width_;
+    for (int l = 0; l < int(levels_.size()); ++l) {
+      const Level& level = levels_[l];
+      for (int tile = 0; tile < level.padded; tile += kTile) {
+        const int first = level.start + tile;
+        Vec sums[kTile];
+#pragma GCC unroll 10
+        for (int i = 0; i < kTile; ++i) {
+          const Vec drive = l == 0 ? now[first + i] : Vec{} + packed_bias_[first + i];
+          sums[i] = Real(level.keep) * potentials[first + i] + drive;
+        }
+        for (const Connection<Real>& connection : connections_) {
+          if (connection.to != l) continue;
+          const Level& from = levels_[connection.from];
+          add_product<Real>(connection.forward + std::ptrdiff_t(tile) * from.padded, from.padded,
+                            (connection.delayed ? before : now) + from.start, sums);
+        }
+#pragma GCC unroll 10
+        for (int i = 0; i < kTile; ++i) {
+          potentials[first + i] = sums[i];
+          now[first + i] = tanh_of(sums[i]);
+        }
+      }
+    }
+  }
+}
+
+// The state before the first step, and the rows of `deltas` that nothing else writes.
+template <typename Real>
+void Pass<Real>::start_rows(Group& group, Vec* potentials) const {
+  for (int i = 0; i < width_; ++i) potentials[i] = Vec{};
+  if (problem_.initial != nullptr) {
+    for (const Level& level : levels_) {
+      for (int lane = 0; lane < kLanes; ++lane) {
+        const Real* initial =
+            problem_.initial + std::ptrdiff_t(group.member[lane]) * units_ + level.first;
+        for (int i = 0; i < level.units; ++i) {
+          potentials[level.start + i][lane] = Real(kSlope) * initial[i];
+        }
+      }
+    }
+  }
+  for (int i = 0; i < width_; ++i) group.hidden[i] = tanh_of(potentials[i]);
+  if (!wants_gradients()) return;
+  Vec* unseen = group.deltas + (lag_ == 0 ? 0 : std::ptrdiff_t(group.steps) * width_);
+  std::fill(unseen, unseen + width_, Vec{});  // no output sees this row
+  Vec* after = group.deltas + std::ptrdiff_t(group.steps + 1) * width_;
+  std::fill(after, after + width_, Vec{});
+}
+
+// Softmax, divergence and, for eq. (6), the deltas of M_O and what they mean to M_F.
+template <typename Real>
+void Pass<Real>::outputs(const Group& group, int chunk, const Scratch& scratch) const {
+  const Level& fast = levels_.back();
+  const int begin = chunk * kChunk;
+  const int end = std::min(begin + kChunk, group.steps);
+  const int outputs = problem_.values * problem_.softmax_units;
+  double divergence = 0;
+  for (int t = begin; t < end; ++t) {
+    const std::ptrdiff_t row = std::ptrdiff_t(t + 1 - lag_) * width_ + fast.start;
+    Vec* potentials = scratch.potentials;
+    for (int tile = 0; tile < outputs_; tile += kTile) {
+      Vec sums[kTile];
+#pragma GCC unroll 10
+      for (int i = 0; i < kTile; ++i) sums[i] = Vec{} + packed_output_bias_[tile + i];
+      add_product<Real>(to_outputs_.forward + std::ptrdiff_t(tile) * fast.padded, fast.padded,
+                        group.hidden + row, sums);
+#pragma GCC unroll 10
+      for (int i = 0; i < kTile; ++i) potentials[tile + i] = sums[i];
+    }
+    const Real* arrays[kLanes];
+    Vec mask{};
+    double entropies = 0;
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const std::int64_t at = group.row[lane] + t;
+      arrays[lane] = problem_.targets + at * outputs;
+      if (lane < group.members) {
+        mask[lane] = problem_.mask[at];
+        entropies += double(problem_.mask[at]) * double(problem_.target_entropies[at]);
+      }
+    }
+    gather(arrays, outputs, scratch.targets);
+    Vec* deltas = scratch.deltas + std::ptrdiff_t(t - begin) * outputs_;
+    const Vec cross = mask * softmax(potentials, scratch.targets, deltas, mask * Real(weight_));
+    divergence += entropies;
+    for (int lane = 0; lane < kLanes; ++lane) divergence += double(cross[lane]);
+    if (!wants_gradients()) continue;
+    for (int i = outputs; i < outputs_; ++i) deltas[i] = Vec{};
+    for (int tile = 0; tile < fast.padded; tile += kTile) {
+      Vec sums[kTile] = {};
+      add_product<Real>(to_outputs_.backward + std::ptrdiff_t(tile) * outputs_, outputs_, deltas,
+                        sums);
+#pragma GCC unroll 10
+      for (int i = 0; i < kTile; ++i) group.deltas[row + tile + i] = sums[i];
+    }
+  }
+  group.divergences[chunk] = divergence;
+  if (!wants_gradients()) return;
+  Real* sums = group.output_sums + chunk * output_sums();
+  std::fill(sums, sums + output_sums(), Real(0));
+  const Vec* sources = group.hidden + std::ptrdiff_t(begin + 1 - lag_) * width_ + fast.start;
+  add_outer_products<Real>(scratch.deltas, outputs_, outputs_, sources, width_, fast.padded,
+                           end - begin, sums);
+  add_totals<Real>(scratch.deltas, outputs_, outputs_, end - begin,
+                   sums + std::ptrdiff_t(outputs_) * fast.padded);
+}
+
+// The cross-entropy of one step; `deltas` are weight (y - y_bar).
+template <typename Real>
+Vector<Real> Pass<Real>::softmax(const Vec* potentials, const Vec* targets, Vec* deltas,
+                                 const Vec& weight) const {
+  const int units = problem_.softmax_units;
+  Vec cross{};
+  for (int value = 0; value < problem_.values; ++value) {
+    Vec highest = potentials[0];
+    for (int i = 1; i < units; ++i) highest = larger(highest, potentials[i]);
+    Vec total{};
+    for (int i = 0; i < units; ++i) {
+      deltas[i] = exp_of(potentials[i] - highest);
+      total += deltas[i];
+    }
+    const Vec share = Real(1) / total;
+    const Vec log_total = highest + log_of(total);
+    for (int i = 0; i < units; ++i) {
+      cross += targets[i] * (log_total - potentials[i]);
+      deltas[i] = weight * (deltas[i] * share - targets[i]);
+    }
+    potentials += units;
+    targets += units;
+    deltas += units;
+  }
+  return cross;
+}
+
+// --- backward ---
+
+template <typename Real>
+void Pass<Real>::scan_backward(Group& group) const {
+  std::fill(group.sums, group.sums + group_sums_, Real(0));
+  int end = group.steps + 1;
+  for (int row = group.steps; row > 0; --row) {
+    step_backward(group, row);
+    if ((row - 1) % kChunk == 0) {
+      sum_gradients(group, row, end);
+      end = row;
+    }
+  }
+  if (problem_.by_initial != nullptr) {
+    step_backward(group, 0);
+    give_initial(group);
+  }
+  if (problem_.by_drive != nullptr) give_drive(group);
+}
+
+// deltas[row] = dE/dv: eq. (6), with the paths inside a step added.
+template <typename Real>
+void Pass<Real>::step_backward(Group& group, int row) const {
+  Vec* now = group.deltas + std::ptrdiff_t(row) * width_;
+  const Vec* after = now + width_;
+  const Vec* hidden = group.hidden + std::ptrdiff_t(row) * width_;
+  for (int l = int(levels_.size()) - 1; l >= 0; --l) {
+    const Level& level = levels_[l];
+    const bool shown = l + 1 == int(levels_.size());  // to M_O, which left what it wants here
+    for (int tile = 0; tile < level.padded; tile += kTile) {
+      const int first = level.start + tile;
+      Vec sums[kTile];
+#pragma GCC unroll 10
+      for (int i = 0; i < kTile; ++i) sums[i] = shown ? now[first + i] : Vec{};
+      for (const Connection<Real>& connection : connections_) {
+        if (connection.from != l || (row == 0 && !connection.delayed)) continue;
+        const Level& to = levels_[connection.to];
+        add_product<Real>(connection.backward + std::ptrdiff_t(tile) * to.padded, to.padded,
+                          (connection.delayed ? after : now) + to.start, sums);
+      }
+#pragma GCC unroll 10
+      for (int i = 0; i < kTile; ++i) {
+        const Vec h = hidden[first + i];
+        now[first + i] = Real(level.keep) * after[first + i] + (Real(1) - h * h) * sums[i];
+      }
+    }
+  }
+}
+
+// Adds what the rows first..end - 1 give to the gradients of connections and biases.
+template <typename Real>
+void Pass<Real>::sum_gradients(const Group& group, int first, int end) const {
+  const Vec* deltas = group.deltas + std::ptrdiff_t(first) * width_;
+  for (const Connection<Real>& connection : connections_) {
+    const Level& to = levels_[connection.to];
+    const Level& from = levels_[connection.from];
+    const Vec* sources = group.hidden + std::ptrdiff_t(first - connection.delayed) * width_;
+    add_outer_products<Real>(deltas + to.start, width_, to.padded, sources + from.start, width_,
+                             from.padded, end - first, group.sums + connection.sums);
+  }
+  add_totals<Real>(deltas, width_, width_, end - first, group.sums + group_sums_ - width_);
+}
+
+template <typename Real>
+void Pass<Real>::give_initial(const Group& group) const {
+  for (int lane = 0; lane < group.members; ++lane) {
+    Real* given = problem_.by_initial + std::ptrdiff_t(group.member[lane]) * units_;
+    for (const Level& level : levels_) {
+      for (int i = 0; i < level.units; ++i) {
+        given[level.first + i] = Real(kSlope) * group.deltas[level.start + i][lane];
+      }
+    }
+  }
+}
+
+template <typename Real>
+void Pass<Real>::give_drive(const Group& group) const {
+  const Level& pfc = levels_.front();
+  for (int lane = 0; lane < group.members; ++lane) {
+    Real* given =
+        problem_.by_drive + std::ptrdiff_t(group.member[lane]) * problem_.steps * pfc.units;
+    for (int t = 0; t < problem_.steps; ++t) {
+      const bool used = t + lag_ < group.steps;
+      const Vec* deltas = group.deltas + std::ptrdiff_t(t + 1 + lag_) * width_ + pfc.start;
+      for (int i = 0; i < pfc.units; ++i) {
+        *given++ = used ? Real(pfc.scale) * deltas[i][lane] : Real(0);
+      }
+    }
+  }
+}
+
+// The gradient of the weights from V_S, whose activity is read as it lies: units side by side.
+template <typename Real>
+void Pass<Real>::inputs(const Group& group, int chunk, const Scratch& scratch) const {
+  const Level& pfc = levels_.front();
+  const int units = problem_.inputs;
+  const int begin = std::max(chunk * kChunk, lag_);
+  const int count = std::min((chunk + 1) * kChunk, group.steps) - begin;
+  const int pitch = row_pitch();
+  for (int i = 0; i < count; ++i) {
+    scatter<Real>(group.deltas + std::ptrdiff_t(begin + i + 1) * width_ + pfc.start, pfc.padded,
+                  scratch.rows + std::ptrdiff_t(i) * pitch, std::ptrdiff_t(kChunk) * pitch);
+  }
+  Real* sums = group.input_sums + chunk * input_sums();
+  std::fill(sums, sums + input_sums(), Real(0));
+  for (int lane = 0; lane < group.members; ++lane) {
+    const Real* deltas = scratch.rows + std::ptrdiff_t(lane) * kChunk * pitch;
+    const Real* seen = problem_.seen + (group.row[lane] + begin - lag_) * units;
+    int f = 0;
+    for (; f + kWide * kLanes <= units; f += kWide * kLanes) {
+      for (int i = 0; i < pfc.padded; i += kSide) {
+        add_rank_products<Real, kWide>(deltas + i, pitch, seen + f, units, count,
+                                       sums + std::ptrdiff_t(i) * units + f);
+      }
+    }
+    for (; f + kLanes <= units; f += kLanes) {
+      for (int i = 0; i < pfc.padded; i += kSide) {
+        add_rank_products<Real, 1>(deltas + i, pitch, seen + f, units, count,
+                                   sums + std::ptrdiff_t(i) * units + f);
+      }
+    }
+    for (; f < units; ++f) {
+      for (int i = 0; i < pfc.padded; ++i) {
+        for (int t = 0; t < count; ++t) {
+          sums[std::ptrdiff_t(i) * units + f] +=
+              deltas[std::ptrdiff_t(t) * pitch + i] * seen[std::ptrdiff_t(t) * units + f];
+        }
+      }
+    }
+  }
+}
+
+// --- the end ---
+
+// Adds up what all pieces of work have summed, in an order that does not depend on the threads.
+template <typename Real>
+void Pass<Real>::add_up() const {
+  double divergence = 0;
+  for (const Group& group : groups_) {
+    for (int chunk = 0; chunk < chunks(group); ++chunk) divergence += group.divergences[chunk];
+  }
+  *problem_.divergence = divergence * weight_;
+  if (!wants_gradients()) return;
+  Real* gradients = problem_.by_parameters;
+  const Level& pfc = levels_.front();
+  const Level& fast = levels_.back();
+  const int outputs = problem_.values * problem_.softmax_units;
+  std::fill(gradients, gradients + output_bias_ + outputs, Real(0));
+  for (const Group& group : groups_) {
+    for (const Connection<Real>& connection : connections_) {
+      const Level& to = levels_[connection.to];
+      const Level& from = levels_[connection.from];
+      add_scaled(group.sums + connection.sums, from.padded, to.units, from.units,
+                 connection.scale, gradients + connection.parameters);
+    }
+    const Real* by_biases = group.sums + group_sums_ - width_;
+    for (std::size_t l = 0; l < levels_.size(); ++l) {
+      add_scaled(by_biases + levels_[l].start, 0, 1, levels_[l].units, Real(levels_[l].scale),
+                 gradients + biases_[l]);
+    }
+    for (int chunk = 0; chunk < chunks(group); ++chunk) {
+      const Real* sums = group.output_sums + chunk * output_sums();
+      add_scaled(sums, fast.padded, outputs, fast.units, to_outputs_.scale,
+                 gradients + to_outputs_.parameters);
+      add_scaled(sums + std::ptrdiff_t(outputs_) * fast.padded, 0, 1, outputs, Real(1),
+                 gradients + output_bias_);
+      add_scaled(group.input_sums + chunk * input_sums(), problem_.inputs, pfc.units,
+                 problem_.inputs, Real(pfc.scale), gradients);
+    }
+  }
+}
+
+template <typename Real>
+int compute(const Problem<Real>* problem) {
+  static thread_local Arena arena;
+  try {
+    Pass<Real>(*problem, arena).run();
+  } catch (const std::bad_alloc&) {
+    return 1;
+  }
+  return 0;
+}
+
+}  // namespace
+
+extern "C" {
+
+int vmdnn_core_float(const Problem<float>* problem) { return compute(problem); }
+
+int vmdnn_core_double(const Problem<double>* problem) { return compute(problem); }
+}

@@ -1,0 +1,41 @@
+"""Tutored sequences side by side, as coupled training reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+
+@dataclass(frozen=True)
+class Sequences:
+    """All sequences, filled up with zeros to the longest.
+
+    Attributes:
+        seen: (S, T, V_S units) activity of V_S.
+        codes: (S, T, values, softmax units) the teacher's outputs; those of a value sum to one.
+        mask: (S, T) one where a sequence has a step.
+        code_entropies: (S, T) sum of codes * log(codes), the part of the divergence that no
+            network changes.
+    """
+
+    seen: Tensor
+    codes: Tensor
+    mask: Tensor
+    code_entropies: Tensor
+
+    @classmethod
+    def stacked(cls, seen: Sequence[Tensor], codes: Sequence[Tensor]) -> Self:
+        """Put sequences (T, ...) of any lengths side by side."""
+        masks = [one.new_ones(len(one)) for one in seen]
+        all_codes = pad_sequence(list(codes), batch_first=True)
+        return cls(
+            seen=pad_sequence(list(seen), batch_first=True),
+            codes=all_codes,
+            mask=pad_sequence(masks, batch_first=True),
+            code_entropies=torch.xlogy(all_codes, all_codes).sum((-1, -2)),
+        )
