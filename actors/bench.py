@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 import re
 import time
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,7 +52,8 @@ class ActorSpeed:
         render_ms: time of one observation, rendering and all.
         network_ms: time of one step of the network.
         steps_per_s: control steps per second of the actor's whole loop.
-        ratio: time of one step of the whole loop over that of the bare simulator doing the same.
+        ratio: processor time of one step of the whole loop over that of the bare simulator doing
+            the same; waiting, such as for a core that others use, does not count.
         episode_s: time of one tutored episode.
     """
 
@@ -70,7 +73,7 @@ def bench_actor(config: Config) -> ActorSpeed:
     The whole loop is an episode as the actor's process plays it: observing, the network, judging,
     recording, and encoding what goes to the bus. In each of its steps a second simulator does the
     same with the same scene and action, and nothing else: the bare loop. Taking turns so often,
-    both meet the same machine, however busy it is.
+    both meet the same machine.
 
     Raises:
         UserError: the simulator cannot run on this machine.
@@ -100,19 +103,30 @@ def bench_actor(config: Config) -> ActorSpeed:
         render_ms=1e3 * median(shadow.render),
         network_ms=1e3 * median(pupil.network_laps),
         steps_per_s=1.0 / median(shadow.whole_loop),
-        ratio=median(shadow.whole_loop) / median(shadow.bare_loop),
+        ratio=median(shadow.whole_work) / median(shadow.bare_work),
         episode_s=median(tutored),
     )
 
 
 class _Laps(list[float]):
-    """How long `with` blocks took, in seconds."""
+    """How long laps took, in seconds of a clock."""
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        super().__init__()
+        self._clock = clock
+        self._started = math.nan
+
+    def start(self) -> None:
+        self._started = self._clock()
+
+    def stop(self) -> None:
+        self.append(self._clock() - self._started)
 
     def __enter__(self) -> None:
-        self._started = time.perf_counter()
+        self.start()
 
     def __exit__(self, *_: object) -> None:
-        self.append(time.perf_counter() - self._started)
+        self.stop()
 
 
 class _Pupil:
@@ -167,7 +181,8 @@ class _Shadow:
     """Does in a simulator of its own what another is told, step by step, and measures both."""
 
     def __init__(self, simulator: Simulator, task: Task) -> None:
-        self.whole_loop, self.bare_loop, self.render, self.physics = (_Laps() for _ in range(4))
+        self.whole_loop, self.render, self.physics = _Laps(), _Laps(), _Laps()
+        self.whole_work, self.bare_work = _Laps(time.process_time), _Laps(time.process_time)
         self._simulator = simulator
         self._task = task
 
@@ -175,19 +190,22 @@ class _Shadow:
         """Start an episode."""
         self._simulator.reset(self._task.scene(situation))
         self._focus = float(self._task.start[FOCUS])
-        self._followed_at: float | None = None
+        self._first = True
 
     def follow(self, action: NDArray[np.float64]) -> None:
         """Observe and run one control step; between two calls the other loop goes round once."""
-        if self._followed_at is not None:
-            self.whole_loop.append(time.perf_counter() - self._followed_at)
-        with self.bare_loop:
+        if not self._first:
+            self.whole_loop.stop()
+            self.whole_work.stop()
+        with self.bare_work:
             with self.render:
                 self._simulator.observe(crop_of_focus(self._focus))
             with self.physics:
                 self._simulator.step(targets_of_action(action))
         self._focus = float(action[FOCUS])
-        self._followed_at = time.perf_counter()
+        self._first = False
+        self.whole_loop.start()
+        self.whole_work.start()
 
 
 def _play(
