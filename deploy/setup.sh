@@ -89,7 +89,8 @@ setup_graphics() {
     fi
     if ! can_install; then
         explain_graphics || true
-        fail "no graphics driver that can render; as root: $(apt_line "${release[@]}" "${packages[@]}")"
+        fail "no graphics driver that can render; start this once as root, or as root:" \
+            "$(apt_line "${release[@]}" "${packages[@]}")"
     fi
     say "installing the graphics driver (${packages[*]})"
     if [[ "$(system)" == debian-12 ]]; then add_backports; fi
