@@ -1,7 +1,7 @@
 # shellcheck shell=bash
-# Sourced by run_local.sh and test.sh. `setup` brings this checkout to where it can run: Python, the
-# locked packages in .venv, and a graphics driver that can render. What is there already is left
-# alone, so that a second call takes about a second.
+# Sourced by run_local.sh and test.sh. `setup` brings this checkout to where it can run: Python, a
+# compiler, the locked packages in .venv, and a graphics driver that can render. What is there is
+# left alone, so that a second call takes about a second.
 
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="$ROOT/.venv"
@@ -9,6 +9,7 @@ LOCK="$ROOT/deploy/requirements.lock"
 
 setup() {
     setup_python
+    setup_compiler
     setup_packages
     setup_graphics
 }
@@ -45,6 +46,22 @@ setup_python() {
     fi
     say "making .venv with $("$PYTHON" --version)"
     "$PYTHON" -m venv "$VENV"
+}
+
+# --- compiler ---------------------------------------------------------------------------------
+
+# Training compiles its kernel for this machine's processor, and is slower where it cannot.
+setup_compiler() {
+    local compiler
+    for compiler in "${CXX:-c++}" g++ clang++; do
+        if command -v "$compiler" >/dev/null; then return; fi
+    done
+    if ! can_install; then
+        say "there is no C++ compiler, so training will be slower; as root: $(apt_line g++)"
+        return
+    fi
+    say "installing a C++ compiler"
+    apt_install g++
 }
 
 # --- packages ---------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from actors.backends.sapien.graphics import CURE, diagnose
+from learner.kernels.build import NotCompiledError, find_or_compile
 from proto.config import Config
 from services.ports import port_trouble
 
@@ -54,6 +55,7 @@ def examine(config: Config) -> Iterator[Finding]:
     yield check_memory(_available_memory_gb())
     yield check_disk(config.run.folder)
     yield check_port(config.hub.endpoint)
+    yield check_kernel()
     yield check_graphics()
 
 
@@ -121,6 +123,18 @@ def check_port(endpoint: str) -> Finding:
     if trouble := port_trouble(endpoint):
         return Finding("hub port", endpoint, trouble)
     return Finding("hub port", f"{endpoint} is free")
+
+
+def check_kernel() -> Finding:
+    """Training has its kernel, compiled for this machine's processor."""
+    try:
+        return Finding("kernel", f"compiled: {find_or_compile()}")
+    except NotCompiledError as error:
+        return Finding(
+            "kernel",
+            f"not compiled: {error}",
+            "training works without it, but slower; as root: apt-get install g++",
+        )
 
 
 def check_graphics() -> Finding:

@@ -14,6 +14,7 @@ from services.doctor import (
     LOCK,
     check_cores,
     check_disk,
+    check_kernel,
     check_memory,
     check_packages,
     check_port,
@@ -27,7 +28,7 @@ def test_this_machine_is_well(capsys: pytest.CaptureFixture[str]) -> None:
     status = main(["doctor", "--json", "--set", f"hub.endpoint={free_endpoint()}"])
     findings = {finding["check"]: finding for finding in json.loads(capsys.readouterr().out)}
     assert set(findings) == {
-        "python", "packages", "cores", "memory", "disk", "hub port", "graphics",
+        "python", "packages", "cores", "memory", "disk", "hub port", "kernel", "graphics",
     }  # fmt: skip
     assert findings["graphics"]["ok"], findings["graphics"]
     assert status == (0 if all(finding["ok"] for finding in findings.values()) else 1)
@@ -69,6 +70,15 @@ def test_too_little_of_anything_is_a_problem(tmp_path: Path) -> None:
     assert check_memory(8.0).ok
     assert check_disk(tmp_path / "not" / "yet" / "there").found.endswith(str(tmp_path))
     assert check_python().ok
+
+
+def test_without_a_compiler_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CXX", raising=False)
+    assert "apt-get install g++" in check_kernel().advice
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no.such.host.invalid"])
