@@ -42,10 +42,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Train until done or Ctrl-C; either way the run's folder holds all that was learned."""
     config = config_of(arguments)
-    store = _filled_store(arguments.data)
-    others = arguments.pretraining_data
+    store = _filled_store("--data", arguments.data)
+    others = None
+    if arguments.pretraining_data is not None:
+        others = _filled_store("--pretraining-data", arguments.pretraining_data)
     folder: Path = arguments.out
-    trainer = open_training(config, folder, store, _filled_store(others) if others else None)
+    trainer = open_training(config, folder, store, others)
     config.save(folder / "config.yaml")
     if trainer.finished:
         print(f"{folder} is trained already; learner.epochs above {trainer.epochs_done} goes on")
@@ -64,13 +66,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _filled_store(folder: Path) -> TutoringStore:
+def _filled_store(option: str, folder: Path) -> TutoringStore:
     if not folder.is_dir():
-        raise UserError(f"--data {folder} is no folder; record one with `vmdnn tutor --out DIR`")
+        raise UserError(f"{option} {folder} is no folder; record one with `vmdnn tutor --out DIR`")
     store = TutoringStore(folder)
     if not store.ids:
         raise UserError(
-            f"--data {folder} holds no sequence (*.mcap); record some with `vmdnn tutor --out DIR`"
+            f"{option} {folder} holds no sequence (*.mcap); record some with `vmdnn tutor --out DIR`"
         )
     return store
 
