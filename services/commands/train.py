@@ -72,7 +72,8 @@ def _filled_store(option: str, folder: Path) -> TutoringStore:
     store = TutoringStore(folder)
     if not store.ids:
         raise UserError(
-            f"{option} {folder} holds no sequence (*.mcap); record some with `vmdnn tutor --out DIR`"
+            f"{option} {folder} holds no sequence (*.mcap); record some with"
+            " `vmdnn tutor --out DIR`"
         )
     return store
 
