@@ -93,7 +93,7 @@ class Supervisor:
         self._folder.mkdir(parents=True, exist_ok=True)
         # A socket's path may have 107 characters at most, so it cannot lie in the run's folder.
         self._socket_folder = tempfile.TemporaryDirectory(prefix="vmdnn-")
-        socket = Path(self._socket_folder.name) / "supervisord.sock"
+        socket = Path(self._socket_folder.name) / "socket"
         config = self._folder / "supervisord.conf"
         config.write_text(supervisord_config(self.programs, self._folder, socket))
         self._socket = socket

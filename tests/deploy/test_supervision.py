@@ -93,7 +93,10 @@ def test_nothing_outlives_a_supervisor_that_is_killed(tmp_path: Path, deadly: in
         "    print(supervisor.processes()[0].pid, flush=True)\n"
         "    time.sleep(600)\n"
     )
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = os.environ | {
+        "PYTHONPATH": str(Path(__file__).parents[2]),
+        "TMPDIR": str(tmp_path),  # a killed process does not tidy up
+    }
     with subprocess.Popen(
         (sys.executable, "-c", script), stdout=subprocess.PIPE, text=True, env=environment
     ) as parent:
