@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
-import platform
-import re
 import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Final
 
@@ -33,6 +29,7 @@ from proto.action import ACTION_VALUES, FOCUS
 from proto.codec import encode
 from proto.config import Config, NetworkConfig
 from proto.episode import Floats, Image, Kind
+from proto.machine import machine_name
 from proto.messages import Rollout
 from proto.metrics import Stage
 
@@ -97,7 +94,7 @@ def bench_actor(config: Config) -> ActorSpeed:
                 _play(simulator, task, tutor, situation)
         backend = simulator.name
     return ActorSpeed(
-        machine=_machine(),
+        machine=machine_name(),
         backend=backend,
         physics_ms=1e3 * median(shadow.physics) / config.simulator.substeps,
         render_ms=1e3 * median(shadow.render),
@@ -227,17 +224,3 @@ def _play(
         simulator, task, policy, situation, seed=0, kind=assignment.kind, on_step=on_step
     )
     encode(Rollout(episode, "bench"))
-
-
-def _machine() -> str:
-    cores = len(os.sched_getaffinity(0))
-    return f"{_processor()}, {cores} core{'s' if cores > 1 else ''}"
-
-
-def _processor() -> str:
-    try:
-        text = Path("/proc/cpuinfo").read_text()
-    except OSError:
-        text = ""
-    found = re.search(r"^model name\s*: (.*)$", text, re.MULTILINE)
-    return found[1] if found else platform.processor() or platform.machine()

@@ -64,7 +64,7 @@ class Optimization:
     def __init__(self, lesson: Lesson, plan: Plan) -> None:
         self._lesson = lesson
         self._plan = plan
-        self._adam = torch.optim.Adam(lesson.parameters, plan.rate)
+        self._adam = torch.optim.Adam(lesson.parameters, plan.rate, fused=True)
 
     def epoch(self, number: int, generator: torch.Generator) -> float:
         """Show every sequence once, in minibatches of nearly equal size; the mean loss.

@@ -5,6 +5,9 @@ Slow. It is what the kernels are tested against and what `vmdnn bench bptt` comp
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -15,6 +18,16 @@ from learner.sequences import Sequences
 from learner.vmdnn import VMDNN
 
 
+class State(NamedTuple):
+    """What goes from step to step, for PFC, M_S and M_F; each (B, units)."""
+
+    potentials: tuple[Tensor, ...]
+    activities: tuple[Tensor, ...]
+
+
+Step = Callable[[VMDNN, Tensor, State], State]
+
+
 def plain_divergence(
     network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor | None = None
 ) -> Tensor:
@@ -23,30 +36,38 @@ def plain_divergence(
     return kl_divergence(log_outputs, sequences.codes[chosen], sequences.mask[chosen])
 
 
-def plain_outputs(network: VMDNN, seen: Tensor, initial: Tensor | None = None) -> Tensor:
-    """`VMDNN.act`, step by step: eq. (1) and (2)."""
-    levels = network.levels()
+def plain_step(network: VMDNN, below: Tensor, state: State) -> State:
+    """One step: eq. (1) and (2). `below` is V_S, of the step before if the order is literal."""
     literal = network.config.update_order == "literal"
-    units = [level.units for level in levels]
+    before = state.activities
+    potentials, activities = [], []
+    for index, level in enumerate(network.levels()):
+        drive = functional.linear(below, level.input, level.bias)
+        drive = drive + functional.linear(before[index], level.recurrent)
+        if level.feedback is not None:
+            drive = drive + functional.linear(before[index + 1], level.feedback)
+        leak = 1 / level.tau
+        potentials.append((1 - leak) * state.potentials[index] + leak * drive)
+        activities.append(activation(potentials[-1]))
+        below = before[index] if literal else activities[-1]
+    return State(tuple(potentials), tuple(activities))
+
+
+def plain_outputs(
+    network: VMDNN, seen: Tensor, initial: Tensor | None = None, step: Step = plain_step
+) -> Tensor:
+    """`VMDNN.act`, step by step."""
+    literal = network.config.update_order == "literal"
+    units = [level.units for level in network.levels()]
     if initial is None:
         initial = seen.new_zeros(len(seen), sum(units))
-    potentials = list(torch.split(initial, units, dim=1))
-    activities = [activation(potential) for potential in potentials]
-    nothing = torch.zeros_like(seen[:, 0])
+    potentials = torch.split(initial, units, dim=1)
+    state = State(potentials, tuple(activation(potential) for potential in potentials))
+    before = torch.zeros_like(seen[:, 0])
     outputs = []
-    for step in range(seen.shape[1]):
-        before = list(activities)
-        below = seen[:, step]
-        if literal:
-            below = seen[:, step - 1] if step else nothing
-        for index, level in enumerate(levels):
-            drive = functional.linear(below, level.input, level.bias)
-            drive = drive + functional.linear(before[index], level.recurrent)
-            if level.feedback is not None:
-                drive = drive + functional.linear(before[index + 1], level.feedback)
-            leak = 1 / level.tau
-            potentials[index] = (1 - leak) * potentials[index] + leak * drive
-            activities[index] = activation(potentials[index])
-            below = before[index] if literal else activities[index]
-        outputs.append(network.outputs(below))
+    for now in seen.unbind(1):
+        shown = state.activities[-1]
+        state = step(network, before if literal else now, state)
+        before = now
+        outputs.append(network.outputs(shown if literal else state.activities[-1]))
     return torch.stack(outputs, dim=1)

@@ -39,3 +39,7 @@ class Sequences:
             mask=pad_sequence(masks, batch_first=True),
             code_entropies=torch.xlogy(all_codes, all_codes).sum((-1, -2)),
         )
+
+    def to(self, device: torch.device) -> Self:
+        """The same on another device."""
+        return type(self)(*(tensor.to(device) for tensor in vars(self).values()))

@@ -20,6 +20,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -1108,9 +1109,44 @@ int compute(const Problem<Real>* problem) {
   return 0;
 }
 
+// Floating point operations that one thread does in `rounds` rounds of multiply-adds, which depend
+// on nothing but registers.
+double multiply_add(long rounds) {
+  constexpr int kChains = 16;  // enough to fill the pipelines of two units
+  Vector<float> sums[kChains] = {};
+  Vector<float> factor = Vector<float>{} + 0.999f;
+  asm volatile("" : "+m"(factor));  // not known when compiling
+  const Vector<float> x = factor;
+  for (long round = 0; round < rounds; ++round) {
+#pragma GCC unroll 16
+    for (int i = 0; i < kChains; ++i) sums[i] = sums[i] * x + x;
+  }
+  for (int i = 1; i < kChains; ++i) sums[0] += sums[i];
+  const volatile float used = sums[0][0];
+  static_cast<void>(used);
+  return 2.0 * kChains * Simd<float>::kLanes * double(rounds);
+}
+
 }  // namespace
 
 extern "C" {
+
+// The machine's peak: floating point operations per second of `threads` threads.
+double vmdnn_peak_flops(int threads) {
+  const auto start = std::chrono::steady_clock::now();
+  std::atomic<double> operations{0};
+  std::vector<std::thread> helpers;
+  for (int i = 0; i < threads; ++i) {
+    helpers.emplace_back([&operations] {
+      const double done = multiply_add(2000000);
+      for (double sum = operations; !operations.compare_exchange_weak(sum, sum + done);) {
+      }
+    });
+  }
+  for (std::thread& helper : helpers) helper.join();
+  const std::chrono::duration<double> taken = std::chrono::steady_clock::now() - start;
+  return operations / taken.count();
+}
 
 int vmdnn_core_float(const Problem<float>* problem) { return compute(problem); }
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, cast
 
@@ -19,6 +20,7 @@ from torch.autograd.function import FunctionCtx
 from learner.kernels.build import NotCompiledError, find_or_compile
 from learner.sequences import Sequences
 from learner.vmdnn import VMDNN
+from proto.errors import UserError
 
 _log = logging.getLogger(__name__)
 
@@ -51,11 +53,27 @@ def divergence(
     network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor | None = None
 ) -> Tensor:
     """`learner.divergence.divergence`, computed by the kernel."""
-    parameters = network.core_parameters()
+    differentiable = (initial, sequences.seen, *network.core_parameters())
+    wanted = [
+        torch.is_grad_enabled() and each is not None and each.requires_grad
+        for each in differentiable
+    ]
     result = _Divergence.apply(  # type: ignore[no-untyped-call]
-        network, sequences, chosen, initial, sequences.seen, *parameters
+        network, sequences, chosen, wanted, *differentiable
     )
     return cast("Tensor", result)
+
+
+def peak_flops(threads: int) -> float:
+    """Floating point operations per second of multiply-adds on registers alone.
+
+    Raises:
+        UserError: there is no compiled kernel, and so no such loop.
+    """
+    library = _library()
+    if library is None:
+        raise UserError("the kernel is not compiled here: install a C++ compiler, such as g++")
+    return float(library.vmdnn_peak_flops(threads))
 
 
 @dataclass(frozen=True)
@@ -76,11 +94,12 @@ class _Divergence(torch.autograd.Function):
         network: VMDNN,
         sequences: Sequences,
         chosen: Tensor,
+        wanted: Sequence[bool],  # of the derivatives by what follows
         initial: Tensor | None,
-        seen: Tensor,  # only to be differentiated by
+        seen: Tensor,
         *parameters: Tensor,
     ) -> Tensor:
-        _, _, _, by_initial, by_seen, *by_parameters = ctx.needs_input_grad  # type: ignore[attr-defined]
+        by_initial, by_seen, *by_parameters = wanted
         loss, gradients = _call(
             network,
             sequences,
@@ -104,9 +123,7 @@ class _Divergence(torch.autograd.Function):
         (by_loss,) = by_outputs
         gradients: _Gradients = ctx.gradients
         parameters = ctx.saved_tensors
-        if gradients.by_parameters is None:
-            return (None,) * (5 + len(parameters))
-        flat = gradients.by_parameters * by_loss
+        flat = cast("Tensor", gradients.by_parameters) * by_loss
         parts = torch.split(flat, [parameter.numel() for parameter in parameters])
         by_initial = None if gradients.by_initial is None else gradients.by_initial * by_loss
         by_seen = None
@@ -114,7 +131,7 @@ class _Divergence(torch.autograd.Function):
             by_chosen = (gradients.by_drive * by_loss) @ parameters[0]
             by_seen = by_chosen.new_zeros(ctx.seen_shape).index_add_(0, ctx.chosen, by_chosen)
         return (
-            *(None, None, None, by_initial, by_seen),
+            *(None, None, None, None, by_initial, by_seen),
             *(part.view_as(parameter) for part, parameter in zip(parts, parameters, strict=True)),
         )
 
@@ -203,12 +220,22 @@ def _address(tensor: Tensor | None) -> int | None:
 
 @functools.cache
 def _functions() -> dict[torch.dtype, Any]:
-    """The kernel by type, none where it cannot be compiled; says once which it is."""
+    """The kernel by type, none where it cannot be compiled."""
+    library = _library()
+    if library is None:
+        return {}
+    return {torch.float32: library.vmdnn_core_float, torch.float64: library.vmdnn_core_double}
+
+
+@functools.cache
+def _library() -> ctypes.CDLL | None:
+    """The compiled library, if there is one; says once whether."""
     try:
         path = find_or_compile()
         library = ctypes.CDLL(str(path))
     except (NotCompiledError, OSError) as error:
         _log.warning("recurrent core: in PyTorch, several times slower than compiled: %s", error)
-        return {}
+        return None
     _log.info("recurrent core: compiled C++ (%s)", path)
-    return {torch.float32: library.vmdnn_core_float, torch.float64: library.vmdnn_core_double}
+    library.vmdnn_peak_flops.restype = ctypes.c_double
+    return library

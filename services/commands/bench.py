@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from actors.bench import ActorSpeed, bench_actor
-from services.commands.options import add_config, config_of
+from actors.bench import bench_actor
+from learner.bench import bench_bptt
+from services.commands.options import add_config, config_of, positive
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -17,13 +20,34 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actor = subjects.add_parser(
         "actor", help="physics, rendering, the network's step, and the actor's whole loop"
     )
-    add_config(actor)
-    actor.add_argument("--json", action="store_true", help="print JSON instead of lines")
+    bptt = subjects.add_parser(
+        "bptt", help="one epoch of coupled training, beside other ways to compute it"
+    )
+    bptt.add_argument("--batch", type=positive, default=45, help="sequences")
+    bptt.add_argument("--steps", type=positive, default=124, help="their length")
+    bptt.add_argument(
+        "--threads", type=positive, default=len(os.sched_getaffinity(0)), help="of each contender"
+    )
+    bptt.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="where to compute")
+    for subject in (actor, bptt):
+        add_config(subject)
+        subject.add_argument("--json", action="store_true", help="print JSON instead of lines")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure and print."""
-    speed = _rounded(bench_actor(config_of(arguments)))
+    config = config_of(arguments)
+    if arguments.subject == "actor":
+        speed = _rounded(asdict(bench_actor(config)))
+    else:
+        measured = bench_bptt(
+            config,
+            batch=arguments.batch,
+            steps=arguments.steps,
+            threads=arguments.threads,
+            device=arguments.device,
+        )
+        speed = _rounded(asdict(measured))
     if arguments.json:
         print(json.dumps(speed))
     else:
@@ -32,8 +56,11 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _rounded(speed: ActorSpeed) -> dict[str, Any]:
-    return {
-        name: round(value, 4) if isinstance(value, float) else value
-        for name, value in asdict(speed).items()
-    }
+def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _round(value) for name, value in values.items()}
+
+
+def _round(value: object) -> object:
+    if isinstance(value, Mapping):
+        return _rounded(value)
+    return round(value, 4) if isinstance(value, float) else value

@@ -241,6 +241,7 @@ def test_without_a_compiler_pytorch_computes_it(
     monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
     monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
     cpu._functions.cache_clear()
+    cpu._library.cache_clear()
     try:
         network = network_of(NetworkConfig())
         sequences, chosen = sequences_for(network, [5]), torch.tensor([0])
@@ -249,4 +250,5 @@ def test_without_a_compiler_pytorch_computes_it(
         assert torch.equal(divergence(network, sequences, chosen), expected)
     finally:
         cpu._functions.cache_clear()
+        cpu._library.cache_clear()
     assert len([line for line in caplog.messages if "no C++ compiler" in line]) == 1
