@@ -1,4 +1,4 @@
-"""Compiles the C++ kernel when the package is installed; all else is in pyproject.toml."""
+"""Compiles the C++ kernels when the package is installed; all else is in pyproject.toml."""
 
 from __future__ import annotations
 
@@ -37,10 +37,11 @@ class CompileKernel(build_ext):
         try:
             builder.compile_into(Path(self.get_ext_fullpath(ext.name)).parent)
         except builder.NotCompiledError as error:
-            self.warn(f"the C++ kernel is not compiled: {error}")
+            self.warn(f"the C++ kernels are not compiled: {error}")
 
 
+sources = [f"learner/kernels/{name}" for name in builder.SOURCES]
 setup(
-    ext_modules=[Extension("learner.kernels.core", ["learner/kernels/core.cpp"], optional=True)],
+    ext_modules=[Extension("learner.kernels.library", sources, optional=True)],
     cmdclass={"build_ext": CompileKernel},
 )

@@ -15,7 +15,7 @@ from learner.checkpoint import (
     checkpoint_from_bytes,
     load_checkpoint,
 )
-from learner.stepping import Parameters, SteppingNetwork
+from learner.stepping import Parameters, make_acting_network
 from learner.vision_input import vision_input
 from proto.episode import Image
 from proto.errors import UserError
@@ -54,7 +54,7 @@ class NetworkPolicy:
         self.version = metadata.version
         self.outputs: NDArray[np.float32] | None = np.zeros(code.references.size, np.float32)
         self._code = code
-        self._network = SteppingNetwork(metadata.network, parameters)
+        self._network = make_acting_network(metadata.network, parameters)
         self._image_shape = (height, width)
 
     @classmethod

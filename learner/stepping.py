@@ -1,7 +1,8 @@
-"""VMDNN one step at a time (paper, section 3.2), for acting: numpy alone, no gradients, fast.
+"""VMDNN one step at a time (paper, section 3.2), for acting: no gradients, no PyTorch, fast.
 
-It gives the same numbers as `learner.vmdnn` gives for the whole sequence. A picture is one line of
-numbers, row after row. The rows that a row of units sees follow one another in it, so a strided
+It gives the same numbers as `learner.vmdnn` gives for the whole sequence. Compiled it is faster
+still (`learner.kernels.acting`); here it is in numpy. A picture is one line of numbers, row after
+row. The rows that a row of units sees follow one another in it, so a strided
 convolution is one matrix product: overlapping stretches of that line by the kernels laid out as a
 band along the width.
 """
@@ -9,11 +10,13 @@ band along the width.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Protocol
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from learner.kernels import acting
 from learner.subnets import ACTIVATION_GAIN, ACTIVATION_SLOPE, Subnet, subnets
 from proto.config import NetworkConfig
 
@@ -21,8 +24,30 @@ Array = NDArray[np.floating]
 Parameters = Mapping[str, Array]
 
 
+class ActingNetwork(Protocol):
+    """The network as it acts; its state is neutral until the first step."""
+
+    def reset(self) -> None:
+        """Return to the neutral state."""
+
+    def step(self, image: Array) -> Array:
+        """Outputs (11, softmax units) for the image (height, width) seen now, -1..1."""
+
+
+def make_acting_network(config: NetworkConfig, parameters: Parameters) -> ActingNetwork:
+    """The network compiled, in float32, or in numpy where nothing can be compiled.
+
+    Args:
+        config: the network's sizes.
+        parameters: float32 arrays by name, shaped as `parameter_shapes(config)`.
+    """
+    if acting.available():
+        return acting.CompiledNetwork(config, parameters)
+    return SteppingNetwork(config, parameters)
+
+
 class SteppingNetwork:
-    """The network as it acts; its state is neutral until the first step.
+    """The network in numpy.
 
     Args:
         config: the network's sizes.

@@ -14,4 +14,4 @@ _BRIGHTNESS: Final = ((np.arange(256) / 255 - 0.5) * 2).astype(np.float32)
 
 def vision_input(images: Image) -> NDArray[np.float32]:
     """Grey values 0..255 (..., height, width) uint8 as brightness -1..1, float32."""
-    return np.asarray(_BRIGHTNESS[images])
+    return _BRIGHTNESS.take(images)

@@ -21,218 +21,23 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
-#include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <cstdlib>
-#include <cstring>
 #include <mutex>
 #include <new>
 #include <numeric>
 #include <thread>
-#include <utility>
 #include <vector>
 
-#ifdef __linux__
-#include <sys/mman.h>
-#endif
+#include "lanes.h"
 
+namespace vmdnn {
 namespace {
-
-constexpr double kGain = 1.7159;  // eq. (2)
-constexpr double kSlope = 2.0 / 3.0;
-
-#if defined(__AVX512F__)
-constexpr int kVectorBytes = 64;
-#elif defined(__AVX__)
-constexpr int kVectorBytes = 32;
-#else
-constexpr int kVectorBytes = 16;
-#endif
 
 constexpr int kTile = 10;   // results of a product in registers; units are padded to a multiple
 constexpr int kSide = 5;    // a tile of a weight gradient is kSide x kSide
 constexpr int kWide = 3;    // vectors of inputs in a tile of the gradient of the input weights
 constexpr int kChunk = 32;  // steps that are worked on together where their order does not matter
-
-// ---------------------------------------------------------------------------------------------
-// Vectors
-
-template <typename Real>
-struct Simd {
-  static constexpr int kLanes = kVectorBytes / int(sizeof(Real));
-  typedef Real Vector __attribute__((vector_size(kVectorBytes)));
-};
-
-template <typename Real>
-using Vector = typename Simd<Real>::Vector;
-
-template <typename Real>
-inline Vector<Real> load(const Real* from) {
-  Vector<Real> vector;
-  std::memcpy(&vector, from, sizeof vector);
-  return vector;
-}
-
-template <typename Real>
-inline void store(Real* to, const Vector<Real>& vector) {
-  std::memcpy(to, &vector, sizeof vector);
-}
-
-// The 2 x 2 blocks of size kStep in (a; b), transposed: a keeps its first and gets b's first.
-template <int kStep, typename Vec, int... kLane>
-inline void exchange(Vec& a, Vec& b, std::integer_sequence<int, kLane...>) {
-  constexpr int kLanes = sizeof...(kLane);
-  const Vec first = __builtin_shufflevector(
-      a, b, (kLane & kStep ? kLanes + kLane - kStep : kLane)...);
-  const Vec second = __builtin_shufflevector(
-      a, b, (kLane & kStep ? kLanes + kLane : kLane + kStep)...);
-  a = first;
-  b = second;
-}
-
-template <typename Real, int kStep>
-inline void transpose_from(Vector<Real>* square) {
-  constexpr int kLanes = Simd<Real>::kLanes;
-  if constexpr (kStep < kLanes) {
-#pragma GCC unroll 16
-    for (int row = 0; row < kLanes; ++row) {
-      if ((row & kStep) == 0) {
-        exchange<kStep>(square[row], square[row + kStep],
-                        std::make_integer_sequence<int, kLanes>());
-      }
-    }
-    transpose_from<Real, 2 * kStep>(square);
-  }
-}
-
-// Lane j of vector i becomes lane i of vector j.
-template <typename Real>
-inline void transpose(Vector<Real>* square) {
-  transpose_from<Real, 1>(square);
-}
-
-// Lane i of the result is the sum of the lanes of vector i. The vectors are used up.
-template <typename Real, int kStep = 1>
-inline Vector<Real> sums_of_lanes(Vector<Real>* square) {
-  constexpr int kLanes = Simd<Real>::kLanes;
-  if constexpr (kStep == kLanes) {
-    return square[0];
-  } else {
-#pragma GCC unroll 16
-    for (int row = 0; row < kLanes; row += 2 * kStep) {
-      exchange<kStep>(square[row], square[row + kStep], std::make_integer_sequence<int, kLanes>());
-      square[row] += square[row + kStep];
-    }
-    return sums_of_lanes<Real, 2 * kStep>(square);
-  }
-}
-
-// Arrays of `count` values, one array a lane, as an array of `count` vectors.
-template <typename Real>
-inline void gather(const Real* const* arrays, int count, Vector<Real>* vectors) {
-  constexpr int kLanes = Simd<Real>::kLanes;
-  if (count < kLanes) {
-    for (int i = 0; i < count; ++i) {
-      for (int lane = 0; lane < kLanes; ++lane) vectors[i][lane] = arrays[lane][i];
-    }
-    return;
-  }
-  for (int next = 0; next < count; next += kLanes) {
-    const int start = std::min(next, count - kLanes);  // the last block may overlap the one before
-    Vector<Real> square[kLanes];
-#pragma GCC unroll 16
-    for (int lane = 0; lane < kLanes; ++lane) square[lane] = load(arrays[lane] + start);
-    transpose<Real>(square);
-#pragma GCC unroll 16
-    for (int i = 0; i < kLanes; ++i) vectors[start + i] = square[i];
-  }
-}
-
-// The converse: array `lane` begins at arrays + lane * pitch and has room for whole vectors.
-template <typename Real>
-inline void scatter(const Vector<Real>* vectors, int count, Real* arrays, std::ptrdiff_t pitch) {
-  constexpr int kLanes = Simd<Real>::kLanes;
-  for (int start = 0; start < count; start += kLanes) {
-    Vector<Real> square[kLanes];
-    for (int i = 0; i < kLanes; ++i) {
-      square[i] = start + i < count ? vectors[start + i] : Vector<Real>{};
-    }
-    transpose<Real>(square);
-    for (int lane = 0; lane < kLanes; ++lane) store(arrays + lane * pitch + start, square[lane]);
-  }
-}
-
-// ---------------------------------------------------------------------------------------------
-// Functions of vectors. The float versions are minimax fits with errors below 4e-7 relative.
-
-template <typename Vec, typename... Real>
-inline Vec polynomial(const Vec& x, double highest, Real... lower) {
-  Vec result = Vec{} + decltype(x[0] + x[0])(highest);
-  ((result = result * x + decltype(x[0] + x[0])(lower)), ...);
-  return result;
-}
-
-template <typename Function>
-inline Vector<double> each_lane(Vector<double> x, Function function) {
-  for (int lane = 0; lane < Simd<double>::kLanes; ++lane) x[lane] = function(x[lane]);
-  return x;
-}
-
-inline Vector<double> tanh_of(const Vector<double>& x) {
-  return each_lane(x, [](double value) { return std::tanh(value); });
-}
-
-inline Vector<double> exp_of(const Vector<double>& x) {
-  return each_lane(x, [](double value) { return std::exp(value); });
-}
-
-inline Vector<double> log_of(const Vector<double>& x) {
-  return each_lane(x, [](double value) { return std::log(value); });
-}
-
-inline Vector<float> tanh_of(const Vector<float>& argument) {
-  constexpr float kFlat = 9;  // from here on the nearest float is 1
-  Vector<float> x = argument < kFlat ? argument : Vector<float>{} + kFlat;
-  x = x > -kFlat ? x : Vector<float>{} - kFlat;
-  const Vector<float> square = x * x;
-  const Vector<float> above = polynomial(square, 1.335340532e-08, 2.060817859e-05, 3.495534134e-03,
-                                         1.338098080e-01, 9.999999796e-01);
-  const Vector<float> below = polynomial(square, 7.776043805e-07, 3.285545684e-04, 2.587677853e-02,
-                                         4.671429646e-01, 1.0);
-  return x * above / below;
-}
-
-typedef std::int32_t Integers __attribute__((vector_size(kVectorBytes)));
-
-// For x <= 0.
-inline Vector<float> exp_of(const Vector<float>& argument) {
-  constexpr float kRound = 12582912;  // 1.5 * 2^23: adding it rounds to an integer
-  const Vector<float> x = argument > -87.0f ? argument : Vector<float>{} - 87.0f;
-  const Vector<float> rounded = x * 1.44269504f + kRound;
-  const Vector<float> twos = rounded - kRound;
-  const Vector<float> rest = (x - twos * 0.693359375f) + twos * 2.12194440e-4f;  // ln 2 in 2 parts
-  const Vector<float> power =
-      polynomial(rest, 1.383684192e-03, 8.374815782e-03, 4.166822564e-02, 1.666642017e-01,
-                 4.999999208e-01, 1.000000036e+00, 1.000000001e+00);
-  return Vector<float>(Integers(power) + (Integers(rounded) << 23));
-}
-
-// For normal x > 0.
-inline Vector<float> log_of(const Vector<float>& x) {
-  constexpr std::int32_t kRootHalf = 0x3f3504f3;  // bits of sqrt(1/2)
-  const Integers twos = (Integers(x) - kRootHalf) >> 23;
-  const Vector<float> part = Vector<float>(Integers(x) - (twos << 23)) - 1.0f;
-  const Vector<float> quotient = polynomial(
-      part, 8.722243253e-02, -1.436678817e-01, 1.495228303e-01, -1.656240195e-01, 1.995683282e-01,
-      -2.500207365e-01, 3.333418564e-01, -4.999998797e-01, 9.999999742e-01);
-  return part * quotient + __builtin_convertvector(twos, Vector<float>) * 0.693147181f;
-}
-
-template <typename Vec>
-inline Vec larger(const Vec& a, const Vec& b) {
-  return a > b ? a : b;
-}
 
 // ---------------------------------------------------------------------------------------------
 // Products
@@ -322,48 +127,6 @@ inline void add_rank_products(const Real* left, int left_pitch, const Real* righ
     }
   }
 }
-
-// ---------------------------------------------------------------------------------------------
-// Memory that a thread keeps from call to call: fresh pages would cost more than the arithmetic.
-
-class Arena {
- public:
-  ~Arena() { std::free(memory_); }
-
-  // From here until `reserve`, what `take` gives is only counted.
-  void measure() { used_ = 0; }
-
-  // From here on `take` gives what was counted, and all that was taken before is lost.
-  void reserve() {
-    const std::size_t bytes = used_;
-    used_ = 0;
-    if (bytes <= size_) return;
-    std::free(memory_);
-    size_ = (bytes + kPage - 1) / kPage * kPage;
-    memory_ = static_cast<char*>(std::aligned_alloc(kPage, size_));
-    if (memory_ == nullptr) {
-      size_ = 0;
-      throw std::bad_alloc();
-    }
-#ifdef __linux__
-    madvise(memory_, size_, MADV_HUGEPAGE);
-#endif
-  }
-
-  template <typename Value>
-  Value* take(std::size_t count) {
-    const auto address = reinterpret_cast<std::uintptr_t>(memory_) + used_;
-    used_ += (count * sizeof(Value) + kLine - 1) / kLine * kLine;
-    return reinterpret_cast<Value*>(address);
-  }
-
- private:
-  static constexpr std::size_t kLine = 64;
-  static constexpr std::size_t kPage = std::size_t(1) << 21;
-  char* memory_ = nullptr;
-  std::size_t size_ = 0;
-  std::size_t used_ = 0;
-};
 
 // ---------------------------------------------------------------------------------------------
 // What is asked for
@@ -478,7 +241,7 @@ class Pass {
     Vec* potentials;  // (width,) or (outputs,)
     Vec* targets;     // (outputs,)
     Vec* deltas;      // (kChunk, outputs)
-    Real* rows;       // (lanes, kChunk, pitch)
+    Real* rows;       // (lanes, kChunk, units of the PFC)
   };
 
   struct Task {
@@ -492,7 +255,6 @@ class Pass {
   int chunks(const Group& group, Stage stage) const {
     return stage == kForward || stage == kBackward ? 1 : chunks(group);
   }
-  int row_pitch() const { return (levels_[0].padded + kLanes - 1) / kLanes * kLanes; }
   std::ptrdiff_t output_sums() const {
     return std::ptrdiff_t(outputs_) * (levels_.back().padded + 1);
   }
@@ -664,7 +426,7 @@ void Pass<Real>::take_memory(Arena& arena) {
     scratch.potentials = arena.take<Vec>(std::max(width_, outputs_));
     scratch.targets = arena.take<Vec>(outputs_);
     scratch.deltas = arena.take<Vec>(std::size_t(kChunk) * outputs_);
-    scratch.rows = arena.take<Real>(std::size_t(kLanes) * kChunk * row_pitch());
+    scratch.rows = arena.take<Real>(std::size_t(kLanes) * kChunk * first.padded);
   }
 }
 
@@ -1024,10 +786,14 @@ void Pass<Real>::inputs(const Group& group, int chunk, const Scratch& scratch) c
   const int units = problem_.inputs;
   const int begin = std::max(chunk * kChunk, lag_);
   const int count = std::min((chunk + 1) * kChunk, group.steps) - begin;
-  const int pitch = row_pitch();
+  const int pitch = pfc.padded;
   for (int i = 0; i < count; ++i) {
-    scatter<Real>(group.deltas + std::ptrdiff_t(begin + i + 1) * width_ + pfc.start, pfc.padded,
-                  scratch.rows + std::ptrdiff_t(i) * pitch, std::ptrdiff_t(kChunk) * pitch);
+    Real* arrays[kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) {
+      arrays[lane] = scratch.rows + (std::ptrdiff_t(lane) * kChunk + i) * pitch;
+    }
+    scatter(group.deltas + std::ptrdiff_t(begin + i + 1) * width_ + pfc.start, pitch, arrays,
+            group.members);
   }
   Real* sums = group.input_sums + chunk * input_sums();
   std::fill(sums, sums + input_sums(), Real(0));
@@ -1152,3 +918,5 @@ int vmdnn_core_float(const Problem<float>* problem) { return compute(problem); }
 
 int vmdnn_core_double(const Problem<double>* problem) { return compute(problem); }
 }
+
+}  // namespace vmdnn
