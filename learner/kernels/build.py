@@ -1,8 +1,8 @@
-"""Compile the C++ kernel with the machine's own compiler.
+"""Compile the C++ kernels, one library, with the machine's own compiler.
 
 The library is compiled when the package is installed, else at its first use. Its name holds a
-digest of the source, the flags and the processor, so that what was compiled for another processor
-or from an older source is never loaded.
+digest of the sources, the flags and the processor, so that what was compiled for another processor
+or from older sources is never loaded.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-SOURCE: Final = Path(__file__).with_name("core.cpp")
+FOLDER: Final = Path(__file__).parent
+SOURCES: Final = ("core.cpp", "acting.cpp")
+HEADERS: Final = ("vectors.h", "lanes.h")
 FLAGS: Final = (
     "-std=c++17",
     "-O3",
@@ -35,12 +37,12 @@ class NotCompiledError(Exception):
 
 
 def find_or_compile() -> Path:
-    """The library for this machine: beside the source, in the cache, or freshly compiled there.
+    """The library for this machine: beside the sources, in the cache, or freshly compiled there.
 
     Raises:
         NotCompiledError: there is no compiler, or it failed.
     """
-    for folder in (SOURCE.parent, cache_folder()):
+    for folder in (FOLDER, cache_folder()):
         library = folder / library_name()
         if library.is_file():
             return library
@@ -53,9 +55,10 @@ def cache_folder() -> Path:
 
 
 def library_name() -> str:
-    """File name of the library for this source and this processor."""
-    parts = (SOURCE.read_text(), " ".join(FLAGS), _processor())
-    return f"core-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()[:16]}.so"
+    """File name of the library for these sources and this processor."""
+    texts = ((FOLDER / name).read_text() for name in (*SOURCES, *HEADERS))
+    parts = (*texts, " ".join(FLAGS), _processor())
+    return f"kernels-{hashlib.sha256(chr(0).join(parts).encode()).hexdigest()[:16]}.so"
 
 
 def compile_into(folder: Path) -> Path:
@@ -69,7 +72,8 @@ def compile_into(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             library = Path(scratch) / library_name()
-            command = [compiler, *FLAGS, str(SOURCE), "-o", str(library)]
+            sources = [str(FOLDER / name) for name in SOURCES]
+            command = [compiler, *FLAGS, *sources, "-o", str(library)]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode != 0:
                 raise NotCompiledError(f"{' '.join(command)} failed:\n{done.stderr.strip()}")
