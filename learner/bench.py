@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from learner.divergence import divergence, reference_divergence
-from learner.kernels import cpu
+from learner.kernels.library import peak_flops
 from learner.loss import kl_divergence
 from learner.mstnn import activation
 from learner.plain import Step, plain_divergence, plain_outputs, plain_step
@@ -211,7 +211,7 @@ def _turn(epoch: Epoch) -> list[float]:
 def _peak_flops(device: torch.device, threads: int) -> float:
     """The best of some short bursts."""
     if device.type == "cpu":
-        return max(cpu.peak_flops(threads) for _ in range(20))
+        return max(peak_flops(threads) for _ in range(20))
     torch.backends.cuda.matmul.allow_tf32 = False
     side = torch.ones(8192, 8192, device=device)
     best = math.inf

@@ -1,7 +1,8 @@
 """MSTNN: the vision pathway V_I > V_F > V_S (paper, eq. (3) and (4)), whole sequences at once.
 
 Neither subnet gets anything from above or from itself but its own leak. So the convolutions run
-over all steps of all sequences together, and the leak is one product with a triangular matrix.
+over all steps of all sequences together. That is compiled where there is a compiler; elsewhere it
+is PyTorch, and the leak is one product with a triangular matrix.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from learner.kernels import maps as kernels
 from learner.subnets import ACTIVATION_GAIN, ACTIVATION_SLOPE, Subnet
 
 
@@ -35,6 +37,12 @@ class Maps(nn.Module):
 
     def forward(self, below: Tensor) -> Tensor:
         """Activity (B, T, maps, height, width) for that of the subnet below, alike."""
+        if kernels.serves(below):
+            return kernels.maps(below, self.kernel, self.bias, self.stride, self.tau)
+        return self.reference(below)
+
+    def reference(self, below: Tensor) -> Tensor:
+        """What the compiled kernel computes, in PyTorch."""
         batch, steps = below.shape[:2]
         drive = _convolve(below.flatten(0, 1), self.kernel, self.bias, self.stride)
         potentials = leaky_integral(drive.view(batch, steps, -1), self.tau)

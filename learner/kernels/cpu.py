@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, cast
@@ -17,12 +16,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from learner.kernels.build import NotCompiledError, find_or_compile
+from learner.kernels.library import learning_library
 from learner.sequences import Sequences
 from learner.vmdnn import VMDNN
-from proto.errors import UserError
-
-_log = logging.getLogger(__name__)
 
 _COUNTS: Final = (
     *("levels", "inputs", "values", "softmax_units"),
@@ -62,18 +58,6 @@ def divergence(
         network, sequences, chosen, wanted, *differentiable
     )
     return cast("Tensor", result)
-
-
-def peak_flops(threads: int) -> float:
-    """Floating point operations per second of multiply-adds on registers alone.
-
-    Raises:
-        UserError: there is no compiled kernel, and so no such loop.
-    """
-    library = _library()
-    if library is None:
-        raise UserError("the kernel is not compiled here: install a C++ compiler, such as g++")
-    return float(library.vmdnn_peak_flops(threads))
 
 
 @dataclass(frozen=True)
@@ -221,21 +205,7 @@ def _address(tensor: Tensor | None) -> int | None:
 @functools.cache
 def _functions() -> dict[torch.dtype, Any]:
     """The kernel by type, none where it cannot be compiled."""
-    library = _library()
+    library = learning_library()
     if library is None:
         return {}
     return {torch.float32: library.vmdnn_core_float, torch.float64: library.vmdnn_core_double}
-
-
-@functools.cache
-def _library() -> ctypes.CDLL | None:
-    """The compiled library, if there is one; says once whether."""
-    try:
-        path = find_or_compile()
-        library = ctypes.CDLL(str(path))
-    except (NotCompiledError, OSError) as error:
-        _log.warning("recurrent core: in PyTorch, several times slower than compiled: %s", error)
-        return None
-    _log.info("recurrent core: compiled C++ (%s)", path)
-    library.vmdnn_peak_flops.restype = ctypes.c_double
-    return library

@@ -13,6 +13,7 @@ from torch import Tensor
 from learner.divergence import divergence, reference_divergence
 from learner.kernels import cpu
 from learner.kernels.build import NotCompiledError, find_or_compile
+from learner.kernels.library import learning_library
 from learner.plain import plain_divergence
 from learner.sequences import Sequences
 from learner.vmdnn import VMDNN
@@ -241,7 +242,7 @@ def test_without_a_compiler_pytorch_computes_it(
     monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
     monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
     cpu._functions.cache_clear()
-    cpu._library.cache_clear()
+    learning_library.cache_clear()
     try:
         network = network_of(NetworkConfig())
         sequences, chosen = sequences_for(network, [5]), torch.tensor([0])
@@ -250,5 +251,5 @@ def test_without_a_compiler_pytorch_computes_it(
         assert torch.equal(divergence(network, sequences, chosen), expected)
     finally:
         cpu._functions.cache_clear()
-        cpu._library.cache_clear()
+        learning_library.cache_clear()
     assert len([line for line in caplog.messages if "no C++ compiler" in line]) == 1
