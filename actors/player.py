@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from actors.attention import clip_action, crop_of_focus, targets_of_action
 from actors.policy import Policy
-from actors.simulator import Pose, Simulator
+from actors.simulator import Simulator
 from actors.tasks.task import Situation, Task
 from proto.action import FOCUS
 from proto.episode import Episode, Image, Kind
@@ -59,13 +59,13 @@ def play(
     simulator.reset(task.scene(situation))
     judge = task.judge(situation)
     policy.begin(situation, seed)
-    names = tuple(simulator.bodies())
+    names = tuple(simulator.bodies().places)
     images, actions, targets, joints, poses, outputs = [], [], [], [], [], []
     focus = float(task.start[FOCUS])
     for step, phase in enumerate(task.phases):
         seen = simulator.observe(crop_of_focus(focus))
         action = clip_action(policy.step(seen.image))
-        poses.append(_pose_rows(simulator.bodies(), names))
+        poses.append(simulator.bodies().rows)
         if on_step is not None:
             on_step(LiveStep(step, int(phase), seen.image, seen.joints_deg, action))
         report = simulator.step(targets_of_action(action))
@@ -94,12 +94,8 @@ def play(
         joints_deg=np.asarray(joints, dtype=np.float32),
         phases=task.phases.copy(),
         body_names=names,
-        body_poses=np.asarray(poses, dtype=np.float32),
+        body_poses=np.stack(poses).astype(np.float32),
         outcome=judge.outcome(),
         outputs=np.asarray(outputs, dtype=np.float32) if outputs else None,
         control_period_s=simulator.control_period_s,
     )
-
-
-def _pose_rows(bodies: Mapping[str, Pose], names: tuple[str, ...]) -> list[tuple[float, ...]]:
-    return [(*bodies[name].position_m, *bodies[name].quaternion) for name in names]

@@ -11,7 +11,7 @@ teleported while a scene runs: what is lifted is lifted by friction.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -41,6 +41,29 @@ class Pose:
 
     position_m: tuple[float, float, float]
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies(Mapping[str, Pose]):
+    """Poses of bodies by name.
+
+    Attributes:
+        places: row of each body in `rows`, in the order of the rows.
+        rows: (B, 7) position (m) and unit quaternion (w first) of each body.
+    """
+
+    places: Mapping[str, int]
+    rows: NDArray[np.floating]
+
+    def __getitem__(self, name: str) -> Pose:
+        x, y, z, qw, qx, qy, qz = self.rows[self.places[name]].tolist()
+        return Pose((x, y, z), (qw, qx, qy, qz))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.places)
+
+    def __len__(self) -> int:
+        return len(self.places)
 
 
 @dataclass(frozen=True)
@@ -153,7 +176,7 @@ class Simulator(Protocol):
     def joints_deg(self) -> Array:
         """Measured joint angles (18,) in degrees, without rendering."""
 
-    def bodies(self) -> Mapping[str, Pose]:
+    def bodies(self) -> Bodies:
         """True pose of every box and of every moving link of the robot, by name."""
 
     def show(self, joints_deg: Array, boxes: Mapping[str, Pose]) -> None:

@@ -178,8 +178,8 @@ def closing_fraction(motors_deg: NDArray[np.float64]) -> float:
 
 
 def joints_from_motors(motors_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Joint angles (19,) in degrees, in the order of PHALANGES, for motor angles (9,)."""
-    return np.asarray(_OFFSET_DEG + _COUPLING @ motors_deg, dtype=np.float64)
+    """Joint angles (..., 19) in degrees, in the order of PHALANGES, for motor angles (..., 9)."""
+    return np.asarray(_OFFSET_DEG + motors_deg @ _COUPLING.T, dtype=np.float64)
 
 
 def motors_from_joints(joints_deg: NDArray[np.float64]) -> NDArray[np.float64]:

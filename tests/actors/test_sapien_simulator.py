@@ -205,7 +205,7 @@ def trace(simulator):
                 sorted(report.touches),
                 seen.image.tobytes(),
                 seen.joints_deg.tobytes(),
-                repr(simulator.bodies()),
+                simulator.bodies().rows.tobytes(),
             )
         )
     return rows

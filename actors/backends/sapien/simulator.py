@@ -15,6 +15,7 @@ from actors.backends.sapien.world import RobotBuilder, World
 from actors.simulator import (
     EYE_HEIGHT,
     Array,
+    Bodies,
     Crop,
     Image,
     JointTargets,
@@ -77,7 +78,7 @@ class SapienSimulator:
         self._targets_deg = np.zeros(18)
         # Players ask for these before and after each step.
         self._joints_deg: Array | None = None
-        self._bodies: Mapping[str, Pose] | None = None
+        self._bodies: Bodies | None = None
 
     def reset(self, scene: Scene) -> None:
         """Replace whatever was there with `scene`; the same scene gives the same episode."""
@@ -105,12 +106,13 @@ class SapienSimulator:
         if not np.isfinite(after).all():
             raise ValueError(f"joint targets must be finite, got {after}")
         substeps = self._config.substeps
-        ramp = np.linspace(before, after, substeps + 1)[1:]
+        ramp = _angles_rad(np.linspace(before, after, substeps + 1)[1:])
+        world = self._world
         touches: set[tuple[str, str]] = set()
-        for values in ramp:
-            self._world.drive(_angles_rad(values))
-            self._world.step()
-            touches.update(self._world.touches())
+        for angles_rad in ramp:
+            world.drive(angles_rad)
+            world.step()
+            touches.update(world.touches())
         self._targets_deg = after
         self._forget()
         return StepReport(frozenset(touches))
@@ -130,7 +132,7 @@ class SapienSimulator:
             self._joints_deg = np.concatenate([angles[:9], motors_from_joints(angles[9:])])
         return self._joints_deg.copy()
 
-    def bodies(self) -> Mapping[str, Pose]:
+    def bodies(self) -> Bodies:
         """True pose of every box and of every moving link of the robot, by name."""
         if self._bodies is None:
             self._bodies = self._world.bodies()
@@ -223,6 +225,7 @@ def _values(targets: JointTargets) -> Array:
 
 
 def _angles_rad(motors_deg: Array) -> Array:
-    """Angles (28,) of all joints for the motor angles (18,)."""
-    joints_deg = np.concatenate([motors_deg[:9], joints_from_motors(motors_deg[9:])])
+    """Angles (..., 28) of all joints for the motor angles (..., 18)."""
+    hand_deg = joints_from_motors(motors_deg[..., 9:])
+    joints_deg = np.concatenate([motors_deg[..., :9], hand_deg], axis=-1)
     return np.asarray(np.deg2rad(joints_deg), dtype=np.float64)

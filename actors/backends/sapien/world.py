@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sapien import physx
 from sapien.wrapper.urdf_loader import URDFLoader
 
-from actors.simulator import ROBOT, Box, Pose, Scene
+from actors.simulator import ROBOT, Bodies, Box, Pose, Scene
 from sim_assets.hand import PHALANGES
 from sim_assets.icub import ARM_JOINTS, NECK_JOINTS, Capsule, Collider, Cuboid, IcubModel
 
@@ -130,7 +130,7 @@ class World:
         self._touchers |= {self._bodies[name]: name for name in moving}
         self._moving = {self._bodies[name] for name in moving}
         self._fingers = {link for name, link in self._links.items() if name in _FINGER_LINKS}
-        self._names = [entity.name for entity in self._scene.entities]
+        self._places, self._pose_numbers = _in_packed_poses(self._scene)
         self.put(start_rad, {})
         self.drive(start_rad)
 
@@ -179,14 +179,25 @@ class World:
         parts = self._links | self._bodies
         return {name: body.entity_pose for name, body in parts.items()}
 
-    def bodies(self) -> dict[str, Pose]:
+    def bodies(self) -> Bodies:
         """Poses of all links that can move and of all boxes, by name."""
-        rows = np.frombuffer(self._scene.pack_poses(), dtype=np.float32).reshape(-1, 7).tolist()
-        return {
-            name: Pose((x, y, z), (qw, qx, qy, qz))
-            for name, (qw, qx, qy, qz, x, y, z) in zip(self._names, rows, strict=True)
-            if name not in _STATIC_LINKS
-        }
+        packed = np.frombuffer(self._scene.pack_poses(), dtype=np.float32)
+        return Bodies(self._places, packed[self._pose_numbers])
+
+
+def _in_packed_poses(scene: sapien.Scene) -> tuple[dict[str, int], NDArray[np.intp]]:
+    """Rows of the bodies by name, and where the numbers of each row are among packed poses.
+
+    A packed pose is the quaternion (w first), then the position.
+    """
+    entities = [
+        (number, entity.name)
+        for number, entity in enumerate(scene.entities)
+        if entity.name not in _STATIC_LINKS
+    ]
+    places = {name: row for row, (_, name) in enumerate(entities)}
+    starts = np.array([7 * number for number, _ in entities])
+    return places, starts[:, None] + np.array([4, 5, 6, 0, 1, 2, 3])
 
 
 def _configure_physics() -> None:
