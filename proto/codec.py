@@ -176,17 +176,18 @@ class Blob:
 
 @dataclass(frozen=True)
 class Size:
-    """A size with a name: the same wherever it stands in one message."""
+    """A size with a name: the same wherever it stands in one message, unless it is its own."""
 
     name: str
     least: int
     most: int
+    own: bool = False
 
     def check(self, size: int, where: str, sizes: Sizes) -> None:
         """Take note of a size, or compare it with the one met before."""
         if not self.least <= size <= self.most:
             raise MessageError(where, f"{self.name} = {size} is not in {self.least}..{self.most}")
-        if sizes.setdefault(self.name, size) != size:
+        if not self.own and sizes.setdefault(self.name, size) != size:
             raise MessageError(where, f"{self.name} = {size}, but elsewhere {sizes[self.name]}")
 
 
@@ -260,6 +261,11 @@ class Maybe:
 
 
 @dataclass(frozen=True)
+class Added(Maybe):
+    """A `Maybe` that a message got later: None is not sent, so older programs understand it."""
+
+
+@dataclass(frozen=True)
 class Many:
     """A tuple of items; its length is a `Size`."""
 
@@ -304,13 +310,17 @@ class Table:
 
 @dataclass(frozen=True)
 class Record:
-    """A dataclass, field by field; no field may be missing or unknown."""
+    """A dataclass, field by field; none may be unknown, none but those `Added` may be missing."""
 
     made: type[Any]
     fields: Mapping[str, Check]
 
     def pack(self, value: Any) -> Plain:
-        return {name: check.pack(getattr(value, name)) for name, check in self.fields.items()}
+        return {
+            name: check.pack(getattr(value, name))
+            for name, check in self.fields.items()
+            if not (isinstance(check, Added) and getattr(value, name) is None)
+        }
 
     def unpack(self, plain: Plain, where: str, sizes: Sizes) -> Any:
         if not isinstance(plain, dict):
@@ -320,9 +330,9 @@ class Record:
                 raise MessageError(_path(where, f"{name!a:.64}"), "is not a field of this message")
         values = {}
         for name, check in self.fields.items():
-            if name not in plain:
+            if name not in plain and not isinstance(check, Added):
                 raise MessageError(_path(where, name), "is missing")
-            values[name] = check.unpack(plain[name], _path(where, name), sizes)
+            values[name] = check.unpack(plain.get(name), _path(where, name), sizes)
         return self.made(**values)
 
 

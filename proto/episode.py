@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
-from proto.codec import Array, Integer, Many, Maybe, Number, Size, Table, Text
+from proto.codec import Added, Array, Integer, Many, Maybe, Number, Size, Table, Text
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
+States = Mapping[str, Floats]
 
 JOINTS: Final = len(JOINT_NAMES)
 LARGEST_DEG: Final = 360.0
@@ -106,6 +107,8 @@ class Episode:
         outcome: how it ended.
         outputs: (T, 110) float32, softmax outputs of the network, or None.
         control_period_s: time from one control step to the next (s).
+        states: (T, units) float32 of each subnet by name, its activity, where that was asked for;
+            else None.
     """
 
     id: Id
@@ -130,6 +133,10 @@ class Episode:
         Floats | None, Maybe(Array("float32", (STEPS, Size("outputs", 1, 4096)), 0.0, 1.001))
     ] = field(default=None)
     control_period_s: Annotated[float, Number(1e-6, 1e3)] = 0.1
+    states: Annotated[
+        States | None,
+        Added(Table(Array("float32", (STEPS, Size("units", 1, 65536, own=True))), most=16)),
+    ] = field(default=None)
 
     @property
     def steps(self) -> int:

@@ -5,6 +5,7 @@
 | `/eye` | foxglove.CompressedImage | images[t] as PNG |
 | `/joints` | foxglove.JointStates | joints_deg[t], in radians as the schema asks |
 | `/tf` | foxglove.FrameTransforms | body_poses[t], each body a frame in `world` |
+| `/states` | vmdnn.States | states[t] of each subnet; only where they were asked for |
 | `/step` | vmdnn.Step | phases[t], actions[t], targets[t], outputs[t]; ends step t |
 
 Step t is logged at t control periods. Everything else stands in three metadata records before
@@ -36,12 +37,21 @@ from proto.action import ACTION_NAMES, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
 from proto.episode import Episode, Floats, Image, Kind, Outcome, Reason
 from proto.errors import UserError
 from proto.files import written_whole
-from proto.schemas import CompressedImage, FrameTransforms, JointStates, Message, Step, describe
+from proto.schemas import (
+    CompressedImage,
+    FrameTransforms,
+    JointStates,
+    Message,
+    States,
+    Step,
+    describe,
+)
 
 FORMAT: Final = "1"
 EYE: Final = "/eye"
 JOINTS: Final = "/joints"
 TRANSFORMS: Final = "/tf"
+STATES: Final = "/states"
 STEP: Final = "/step"
 TOPICS: Final[Mapping[str, type[Message]]] = {
     EYE: CompressedImage,
@@ -76,7 +86,8 @@ def write_episode(path: Path, episode: Episode) -> None:
         writer.add_metadata("episode", _episode_texts(episode))
         writer.add_metadata("situation", {k: json.dumps(v) for k, v in episode.situation.items()})
         writer.add_metadata("outcome", _outcome_texts(episode.outcome))
-        channels = {topic: _register(writer, topic, schema) for topic, schema in TOPICS.items()}
+        topics = dict(TOPICS) if episode.states is None else {**TOPICS, STATES: States}
+        channels = {topic: _register(writer, topic, schema) for topic, schema in topics.items()}
         for step in range(episode.steps):
             time_ns = round(step * episode.control_period_s * 1e9)
             for topic, message in _messages(episode, step, time_ns):
@@ -181,7 +192,13 @@ def _messages(episode: Episode, step: int, time_ns: int) -> Iterator[tuple[str, 
     )
     eye.timestamp.FromNanoseconds(time_ns)
     joints.timestamp.FromNanoseconds(time_ns)
-    yield from ((EYE, eye), (JOINTS, joints), (TRANSFORMS, transforms), (STEP, told))
+    yield from ((EYE, eye), (JOINTS, joints), (TRANSFORMS, transforms))
+    if episode.states is not None:
+        states = States()
+        for name, activity in episode.states.items():
+            states.subnets.add(name=name, activity=activity[step].tolist())
+        yield STATES, states
+    yield STEP, told
 
 
 def _episode(contents: _Contents) -> Episode:
@@ -216,6 +233,7 @@ def _episode(contents: _Contents) -> Episode:
         if outputs_size is None
         else _floats([step.outputs for step in steps], (count, outputs_size)),
         control_period_s=float(told["control_period_s"]),
+        states=_states(contents.messages[STATES][:count], json.loads(told.get("states", "null"))),
     )
 
 
@@ -233,9 +251,18 @@ def _episode_texts(episode: Episode) -> dict[str, str]:
         "config_digest": episode.config_digest,
         "control_period_s": repr(episode.control_period_s),
         "steps": str(episode.steps),
+        **_states_text(episode),
         "outputs": json.dumps(None if episode.outputs is None else episode.outputs.shape[1]),
         "body_names": json.dumps(episode.body_names),
     }
+
+
+def _states_text(episode: Episode) -> dict[str, str]:
+    """Number of units by subnet; nothing where no states are kept, as before there were any."""
+    if episode.states is None:
+        return {}
+    units = {name: activity.shape[1] for name, activity in episode.states.items()}
+    return {"states": json.dumps(units)}
 
 
 def _outcome_texts(outcome: Outcome) -> dict[str, str]:
@@ -266,6 +293,16 @@ def _images(messages: Sequence[bytes]) -> Image:
             raise ValueError(f"the picture of step {step} is no PNG")
         images[step] = image
     return images
+
+
+def _states(messages: Sequence[bytes], units: Mapping[str, int] | None) -> dict[str, Floats] | None:
+    if units is None:
+        return None
+    rows: dict[str, list[Sequence[float]]] = {name: [] for name in units}
+    for data in messages:
+        for subnet in States.FromString(data).subnets:
+            rows[subnet.name].append(subnet.activity)
+    return {name: _floats(rows[name], (len(messages), size)) for name, size in units.items()}
 
 
 def _radians(joints_deg: Floats) -> list[float]:

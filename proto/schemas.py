@@ -20,7 +20,15 @@ from google.protobuf.message import Message
 
 from proto.action import ACTION_NAMES
 
-__all__ = ["CompressedImage", "FrameTransforms", "JointStates", "Message", "Step", "describe"]
+__all__ = [
+    "CompressedImage",
+    "FrameTransforms",
+    "JointStates",
+    "Message",
+    "States",
+    "Step",
+    "describe",
+]
 
 
 def _field(number: int, name: str, kind: int, message: str | None = None) -> FieldDescriptorProto:
@@ -59,9 +67,29 @@ def _step_file() -> FileDescriptorProto:
     )
 
 
+def _states_file() -> FileDescriptorProto:
+    """What went on in a network in one control step."""
+    activity = _field(2, "activity", FieldDescriptorProto.TYPE_FLOAT)
+    activity.label = FieldDescriptorProto.LABEL_REPEATED
+    subnet = DescriptorProto(
+        name="Subnet", field=[_field(1, "name", FieldDescriptorProto.TYPE_STRING), activity]
+    )
+    subnets = _field(1, "subnets", FieldDescriptorProto.TYPE_MESSAGE, ".vmdnn.Subnet")
+    subnets.label = FieldDescriptorProto.LABEL_REPEATED
+    return FileDescriptorProto(
+        name="vmdnn/states.proto",
+        package="vmdnn",
+        syntax="proto3",
+        message_type=[subnet, DescriptorProto(name="States", field=[subnets])],
+    )
+
+
 Default().Add(_step_file())
+Default().Add(_states_file())
 Step: Final = message_factory.GetMessageClass(Default().FindMessageTypeByName("vmdnn.Step"))
 """One control step: `step`, `phase`, `action` and `target` (units of `proto.action`), `outputs`."""
+States: Final = message_factory.GetMessageClass(Default().FindMessageTypeByName("vmdnn.States"))
+"""One control step of a network: `subnets`, each with its `name` and `activity`."""
 
 
 def describe(message: type[Message]) -> bytes:

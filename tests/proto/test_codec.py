@@ -106,6 +106,20 @@ def test_a_whole_episode_comes_back_as_it_was(
     received.episode.images[0, 0, 0] = 7  # arrays belong to whoever received them
 
 
+def test_states_come_back_and_are_not_sent_where_there_are_none(sequence: Sequence) -> None:
+    """So that programs from before there were states understand the others."""
+    random = np.random.default_rng(1)
+    states = {name: random.random((3, units), np.float32) for name, units in (("a", 5), ("b", 2))}
+    sent = Sequence(replace(sequence.episode, states=states))
+    received = decode(encode(sent), Sequence).episode.states
+    assert received is not None
+    assert same(states["a"], received["a"])
+    assert same(states["b"], received["b"])
+    assert "states" in msgpack.unpackb(encode(sent).payload)["episode"]
+    assert "states" not in msgpack.unpackb(encode(sequence).payload)["episode"]
+    assert decode(encode(sequence), Sequence).episode.states is None
+
+
 def test_a_live_step_comes_back_as_it_was() -> None:
     random = np.random.default_rng(1)
     sent = Live(
@@ -181,6 +195,11 @@ def test_a_field_of_another_kind_is_refused_by_name(
         (lambda e: e["images"].__setitem__(1, [3, 64, 48]), "episode.images", "[T, 48, 64]"),
         (lambda e: e["actions"].__setitem__(1, [2, 11]), "episode.actions", "T = 2"),
         (lambda e: e["actions"].__setitem__(2, b"12"), "episode.actions", "132 bytes, got 2"),
+        (
+            lambda e: e.update(states={"pfc": ["float32", [2, 1], bytes(8)]}),
+            "episode.states['pfc']",
+            "T = 2",
+        ),
         (lambda e: e["images"].__setitem__(1, [10**9, 48, 64]), "episode.images", "not in 1..2000"),
         (lambda e: e.pop("seed"), "episode.seed", "missing"),
         (lambda e: e.update(mood=1), "episode.'mood'", "not a field"),

@@ -67,6 +67,7 @@ def episodes(draw: st.DrawFn) -> Episode:
         outcome=draw(outcomes()),
         outputs=draw(st.none() | floats(steps, OUTPUTS)),
         control_period_s=draw(st.floats(0.001, 10.0)),
+        states=draw(st.none() | st.dictionaries(word, floats(steps, 7), max_size=3)),
     )
 
 
@@ -93,6 +94,19 @@ def test_every_field_comes_back_exactly(
     again = read_episode(path)
     for item in fields(Episode):
         assert same(getattr(again, item.name), getattr(episode, item.name)), item.name
+
+
+def test_an_episode_without_states_is_recorded_as_before_there_were_any(
+    tmp_path: Path, make_episode: MakeEpisode
+) -> None:
+    path = tmp_path / "episode.mcap"
+    write_episode(path, make_episode(3))
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        assert "/states" not in {channel.topic for channel in summary.channels.values()}
+        (told,) = (r.metadata for r in make_reader(stream).iter_metadata() if r.name == "episode")
+    assert "states" not in told
 
 
 def test_joint_names_agree_with_the_hand() -> None:
