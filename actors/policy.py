@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from actors.tasks.task import Situation
-from proto.episode import Floats, Image
+from proto.episode import Floats, Image, States
 
 
 class Policy(Protocol):
@@ -33,3 +33,11 @@ class Policy(Protocol):
 
     def step(self, image: Image) -> NDArray[np.float64]:
         """Next action (11,), see `proto.action`, for the picture (48, 64) uint8 seen now."""
+
+
+@runtime_checkable
+class StatefulPolicy(Policy, Protocol):
+    """A policy whose inside can be looked into."""
+
+    def states(self, images: Image) -> States:
+        """Activity (T, units) of its parts by name, in an episode with the pictures images."""

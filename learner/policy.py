@@ -15,9 +15,9 @@ from learner.checkpoint import (
     checkpoint_from_bytes,
     load_checkpoint,
 )
-from learner.stepping import Parameters, make_acting_network
+from learner.stepping import Parameters, SteppingNetwork, make_acting_network
 from learner.vision_input import vision_input
-from proto.episode import Image
+from proto.episode import Floats, Image
 from proto.errors import UserError
 
 
@@ -55,6 +55,7 @@ class NetworkPolicy:
         self.outputs: NDArray[np.float32] | None = np.zeros(code.references.size, np.float32)
         self._code = code
         self._network = make_acting_network(metadata.network, parameters)
+        self._sizes, self._parameters = metadata.network, parameters
         self._image_shape = (height, width)
 
     @classmethod
@@ -89,3 +90,15 @@ class NetworkPolicy:
         outputs = self._network.step(vision_input(image))
         self.outputs = np.asarray(outputs, np.float32).ravel()
         return self._code.decode(outputs)
+
+    def states(self, images: Image) -> dict[str, Floats]:
+        """Activity (T, units) of each subnet while it sees images (T, 48, 64), from neutral.
+
+        It is computed anew from what was seen, for the network that acts keeps nothing of it.
+        """
+        network = SteppingNetwork(self._sizes, self._parameters)
+        steps = []
+        for image in images:
+            network.step(vision_input(image))
+            steps.append(network.activity)
+        return {name: np.stack([step[name] for step in steps]) for name in steps[0]}

@@ -97,6 +97,16 @@ class SteppingNetwork:
             (self._outputs["input"] @ top + self._outputs["bias"]).reshape(self._output_shape)
         )
 
+    @property
+    def activity(self) -> dict[str, Array]:
+        """Activity (units,) of each subnet by name after the last step, but V_I and M_O.
+
+        The units of V_F and V_S are ordered by map, row and column.
+        """
+        maps = {"mstnn_fast": self._mstnn_fast, "mstnn_slow": self._mstnn_slow}
+        levels = zip(("pfc", "mtrnn_slow", "mtrnn_fast"), self._levels, strict=True)
+        return {name: each.activity() for name, each in (*maps.items(), *levels)}
+
 
 class _Maps:
     """V_F or V_S; activity is (height, width x maps), the maps of one place side by side."""
@@ -110,6 +120,7 @@ class _Maps:
         self._row_step = stride * width_below * maps_below
         self._leak = kernel.dtype.type(1 / subnet.tau)
         self._shape = (self._height, width * maps)
+        self._maps = maps
         self.reset()
 
     def reset(self) -> None:
@@ -123,6 +134,10 @@ class _Maps:
         drive *= self._leak
         self._potential += drive
         return _activation(self._potential)
+
+    def activity(self) -> Array:
+        by_place = _activation(self._potential).reshape(-1, self._maps)
+        return np.ascontiguousarray(by_place.T).reshape(-1)
 
 
 class _Level:
@@ -142,6 +157,9 @@ class _Level:
         if above is not None:
             drive += weights["feedback"] @ above
         self.potential = self.potential + self._leak * (drive - self.potential)
+        return self.activity()
+
+    def activity(self) -> Array:
         return _activation(self.potential)
 
 
