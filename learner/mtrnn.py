@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx
 
+from learner.kernels import gpu
 from learner.subnets import ACTIVATION_GAIN, ACTIVATION_SLOPE, Subnet
 
 UpdateOrder = Literal["bottom_up", "literal"]
@@ -155,50 +156,71 @@ class _Scan(torch.autograd.Function):
         delayed: Tensor,
         *immediate: Tensor,
     ) -> Tensor:
-        steps, units, batch = drive.shape
-        spans = _spans(delayed, immediate)
-        keep = keep[:, None]
-        hidden = drive.new_empty(steps, units, batch)
-        potential = initial
-        rest = before = torch.tanh(initial)
-        for t in range(steps):
-            now = hidden[t]
-            potential = torch.addcmul(drive[t], potential, keep).addmm_(delayed, before)
-            torch.tanh(potential[spans[0]], out=now[spans[0]])
-            for weights, (below, span) in zip(immediate, pairwise(spans), strict=True):
-                part = potential[span].addmm_(weights, now[below])
-                torch.tanh(part, out=now[span])
-            before = now
-        ctx.save_for_backward(hidden, rest, keep, delayed, *immediate)
+        run = gpu.run if gpu.serves(drive) else _run
+        hidden = run(drive, keep, initial, delayed, immediate)
+        ctx.save_for_backward(hidden, initial, keep, delayed, *immediate)
         return hidden
 
     @staticmethod
     def backward(ctx: FunctionCtx, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (by_hidden,) = gradients
-        hidden, rest, keep, delayed, *immediate = ctx.saved_tensors  # type: ignore[attr-defined]
+        hidden, initial, keep, delayed, *immediate = ctx.saved_tensors  # type: ignore[attr-defined]
+        run_back = gpu.run_back if gpu.serves(hidden) else _run_back
+        deltas = run_back(by_hidden, hidden, keep, delayed, immediate)
         spans = _spans(delayed, immediate)
-        slopes = torch.addcmul(hidden.new_ones(()), hidden, hidden, value=-1)
-        # deltas[t] = dE/dv[t]: eq. (6), with the paths inside a step added.
-        deltas = torch.empty_like(hidden)
-        after = torch.zeros_like(hidden[0])
-        delayed_back = delayed.T.contiguous()
-        immediate_back = [weights.T.contiguous() for weights in immediate]
-        for t in range(len(hidden) - 1, -1, -1):
-            now = deltas[t]
-            by_now = torch.addmm(by_hidden[t], delayed_back, after)
-            kept = after * keep
-            for level in range(len(spans) - 1, -1, -1):
-                span = spans[level]
-                if level < len(immediate):
-                    by_now[span].addmm_(immediate_back[level], now[spans[level + 1]])
-                torch.addcmul(kept[span], slopes[t, span], by_now[span], out=now[span])
-            after = now
-        by_initial = after * keep + (1 - rest * rest) * (delayed_back @ after)
+        rest = torch.tanh(initial)
+        by_rest = delayed.T @ deltas[0]
+        by_initial = deltas[0] * keep[:, None] + (1 - rest * rest) * by_rest
         by_delayed = torch.addmm(_sum_of_products(deltas[1:], hidden[:-1]), deltas[0], rest.T)
         by_immediate = [
             _sum_of_products(deltas[:, span], hidden[:, below]) for below, span in pairwise(spans)
         ]
         return deltas, None, by_initial, by_delayed, *by_immediate
+
+
+def _run(
+    drive: Tensor, keep: Tensor, initial: Tensor, delayed: Tensor, immediate: Sequence[Tensor]
+) -> Tensor:
+    """The activities h (T, N, B) of `_Scan`."""
+    steps, units, batch = drive.shape
+    spans = _spans(delayed, immediate)
+    keep = keep[:, None]
+    hidden = drive.new_empty(steps, units, batch)
+    potential = initial
+    before = torch.tanh(initial)
+    for t in range(steps):
+        now = hidden[t]
+        potential = torch.addcmul(drive[t], potential, keep).addmm_(delayed, before)
+        torch.tanh(potential[spans[0]], out=now[spans[0]])
+        for weights, (below, span) in zip(immediate, pairwise(spans), strict=True):
+            part = potential[span].addmm_(weights, now[below])
+            torch.tanh(part, out=now[span])
+        before = now
+    return hidden
+
+
+def _run_back(
+    by_hidden: Tensor, hidden: Tensor, keep: Tensor, delayed: Tensor, immediate: Sequence[Tensor]
+) -> Tensor:
+    """deltas[t] = dE/dv[t], (T, N, B): eq. (6), with the paths inside a step added."""
+    spans = _spans(delayed, immediate)
+    keep = keep[:, None]
+    slopes = torch.addcmul(hidden.new_ones(()), hidden, hidden, value=-1)
+    deltas = torch.empty_like(hidden)
+    after = torch.zeros_like(hidden[0])
+    delayed_back = delayed.T.contiguous()
+    immediate_back = [weights.T.contiguous() for weights in immediate]
+    for t in range(len(hidden) - 1, -1, -1):
+        now = deltas[t]
+        by_now = torch.addmm(by_hidden[t], delayed_back, after)
+        kept = after * keep
+        for level in range(len(spans) - 1, -1, -1):
+            span = spans[level]
+            if level < len(immediate):
+                by_now[span].addmm_(immediate_back[level], now[spans[level + 1]])
+            torch.addcmul(kept[span], slopes[t, span], by_now[span], out=now[span])
+        after = now
+    return deltas
 
 
 def _sum_of_products(deltas: Tensor, sources: Tensor) -> Tensor:
