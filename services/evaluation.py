@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from actors.tasks.registry import make_task
+from actors.tasks.task import Situation
 from proto.config import Config
 from proto.episode import Kind
+from proto.errors import UserError
 from services.playing import Job
 from services.success import Tally
 
@@ -22,15 +25,35 @@ def trial_jobs(config: Config, trials: int, seed: int, folder: Path | None = Non
         folder: where rollouts are recorded, or None.
     """
     task = make_task(config.task)
+    return situation_jobs([task.sample(seed + trial) for trial in range(trials)], seed, folder)
+
+
+def situation_jobs(
+    situations: Sequence[Situation], seed: int, folder: Path | None = None
+) -> list[Job]:
+    """Trials of given situations; trial i has the seed seed + i."""
     return [
         Job(
-            situation=task.sample(seed + trial),
+            situation=situation,
             seed=seed + trial,
             kind=Kind.TRIAL,
             record_to=None if folder is None else folder / f"trial{trial:04d}.mcap",
         )
-        for trial in range(trials)
+        for trial, situation in enumerate(situations)
     ]
+
+
+def parse_situation(text: str) -> dict[str, float]:
+    """Read a situation such as `obstacle_x_m=-0.27,object_y_m=0.25,object_yaw_deg=44`.
+
+    Raises:
+        UserError: it is written otherwise.
+    """
+    try:
+        pairs = [part.split("=") for part in text.split(",")]
+        return {name.strip(): float(value) for name, value in pairs}
+    except ValueError:
+        raise UserError(f"--situation {text}: write NAME=VALUE,NAME=VALUE,...") from None
 
 
 def result_json(config: Config, policy: str, tally: Tally, wall_s: float) -> dict[str, Any]:

@@ -14,13 +14,13 @@ from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
 from actors.player import play
 from actors.policies import make_policy, make_tutor
-from actors.policy import Policy
+from actors.policy import Policy, StatefulPolicy
 from actors.simulator import Simulator, make_simulator
 from actors.tasks.registry import make_task
 from actors.tasks.task import Situation
@@ -40,6 +40,7 @@ class Job:
         kind: why it is played.
         noisy: the tutor's execution is disturbed; for the tutor only.
         record_to: file to write it to, or None.
+        states: the episode carries the activity of the policy's subnets; for a network only.
     """
 
     situation: Situation
@@ -47,6 +48,7 @@ class Job:
     kind: Kind
     noisy: bool = False
     record_to: Path | None = None
+    states: bool = False
 
 
 def play_all(
@@ -64,7 +66,7 @@ def play_all(
         workers: processes to play in; 1 plays in this one.
 
     Raises:
-        UserError: a worker could not play, or died.
+        UserError: a worker could not play, or died, or the policy has no states to carry.
     """
     if workers <= 1 or len(jobs) <= 1:
         player = _Player(config, policy)
@@ -100,6 +102,7 @@ class _Player:
 
     def play(self, job: Job) -> Episode:
         policy = self._policy_for(job)
+        inside = _with_states(policy) if job.states else None
         # Nobody looks at pictures that are neither seen by the policy nor kept.
         simulator = self._simulator(render=policy.looks or job.record_to is not None)
         episode = play(
@@ -111,6 +114,8 @@ class _Player:
             kind=job.kind,
             config_digest=self._digest,
         )
+        if inside is not None:
+            episode = replace(episode, states=inside.states(episode.images))
         if job.record_to is not None:
             write_episode(job.record_to, episode)
         return episode
@@ -129,6 +134,12 @@ class _Player:
             config = self._config.simulator.model_copy(update={"render": render})
             self._simulators[render] = make_simulator(config)
         return self._simulators[render]
+
+
+def _with_states(policy: Policy) -> StatefulPolicy:
+    if not isinstance(policy, StatefulPolicy):
+        raise UserError(f"policy {policy.name!r} has no states; only a network's checkpoint has")
+    return policy
 
 
 def _pool(workers: int, config: Config, policy: str) -> ProcessPoolExecutor:

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Annotated
 
 from proto.codec import MessageError, Number, Table, Wire, decode, encode, message, schema_of
-from proto.episode import Id, Outcome
+from proto.episode import Episode, Id, Outcome
+from proto.errors import UserError
 from proto.messages import Count, Rollout
 
 LOG = logging.getLogger(__name__)
@@ -39,6 +40,45 @@ class CountedTrial:
     situation: Annotated[Mapping[str, float], Table(Number(), most=32)]
     outcome: Outcome
 
+    @classmethod
+    def of(cls, episode: Episode, run_id: str) -> CountedTrial:
+        """The line of an episode that was played with a policy of the training run_id."""
+        return cls(
+            run_id=run_id,
+            policy_version=episode.policy_version,
+            seed=episode.seed,
+            episode=episode.id,
+            actor=episode.actor,
+            situation=episode.situation,
+            outcome=episode.outcome,
+        )
+
+    def line(self) -> bytes:
+        """One line of JSON."""
+        return encode(self).payload + b"\n"
+
+
+def read_trials(path: Path) -> list[CountedTrial]:
+    """All lines of a book, or of what `vmdnn evaluate --outcomes` wrote.
+
+    Raises:
+        UserError: the file cannot be read, or a line of it is none of a book.
+    """
+    try:
+        lines = path.read_bytes().splitlines()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    try:
+        return [_trial(line) for line in lines]
+    except MessageError as error:
+        raise UserError(
+            f"{path} holds no outcomes of trials ({error}); `vmdnn evaluate --outcomes FILE` does"
+        ) from error
+
+
+def _trial(line: bytes) -> CountedTrial:
+    return decode(Wire(schema_of(CountedTrial).encoding, line), CountedTrial)
+
 
 class TrialBook:
     """Counts each trial of each policy version once, whatever is restarted."""
@@ -59,20 +99,11 @@ class TrialBook:
 
     def add(self, rollout: Rollout) -> bool:
         """Count a trial; False if it was counted before."""
-        episode = rollout.episode
-        trial = CountedTrial(
-            run_id=rollout.run_id,
-            policy_version=episode.policy_version,
-            seed=episode.seed,
-            episode=episode.id,
-            actor=episode.actor,
-            situation=episode.situation,
-            outcome=episode.outcome,
-        )
+        trial = CountedTrial.of(rollout.episode, rollout.run_id)
         if not self._count(trial):
             return False
         with self._path.open("ab") as file:
-            file.write(encode(trial).payload + b"\n")
+            file.write(trial.line())
         return True
 
     def versions(self, run_id: str) -> list[int]:
@@ -92,6 +123,6 @@ class TrialBook:
 
     def _read(self, line: bytes, number: int) -> None:
         try:
-            self._count(decode(Wire(schema_of(CountedTrial).encoding, line), CountedTrial))
+            self._count(_trial(line))
         except MessageError as error:
             LOG.warning("%s, line %d is not counted: %s", self._path, number, error)

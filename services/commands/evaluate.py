@@ -5,18 +5,25 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
+from actors.tasks.registry import make_task
+from proto.config import Config
+from proto.errors import UserError
+from proto.files import written_whole
 from services.commands.options import add_config, add_playing, playing_config, positive
-from services.evaluation import result_json, trial_jobs
-from services.playing import play_all
+from services.evaluation import parse_situation, result_json, situation_jobs, trial_jobs
+from services.playing import Job, play_all
 from services.progress import progress_bar
 from services.replay import write_video
 from services.success import Tally
 from services.tables import success_table
+from services.trial_book import CountedTrial
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -32,23 +39,40 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--seed", type=int, default=1000, help="the same seed gives the same situations"
     )
+    parser.add_argument(
+        "--situation",
+        action="append",
+        metavar="NAME=VALUE,...",
+        help="play this situation instead of those of the seed, such as"
+        " obstacle_x_m=-0.27,object_y_m=0.25,object_yaw_deg=44; may be repeated",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--outcomes", type=Path, help="file for one line of JSON a trial")
     parser.add_argument("--out", type=Path, help="folder in which the rollouts are recorded")
+    parser.add_argument(
+        "--states",
+        action="store_true",
+        help="the rollouts carry the activity of the network's subnets; a megabyte each",
+    )
     parser.add_argument("--video", type=Path, help="MP4 file for a video of the first trial")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Play the trials and print what succeeded."""
     config = playing_config(arguments)
-    jobs = trial_jobs(config, arguments.trials, arguments.seed, arguments.out)
+    jobs = _jobs(config, arguments)
     tally, first = Tally(), None
+    trials: list[CountedTrial] = []
     started = time.monotonic()
     played = play_all(config, arguments.policy, jobs, workers=arguments.workers)
     with progress_bar(f"evaluating {arguments.policy}", len(jobs)) as advance, closing(played):
         for job, episode in played:
             tally.add(episode.outcome)
+            trials.append(CountedTrial.of(episode, run_id=episode.policy))
             first = episode if job is jobs[0] else first
             advance()
+    if arguments.outcomes is not None:
+        _write_outcomes(arguments.outcomes, trials)
     result = result_json(config, arguments.policy, tally, time.monotonic() - started)
     if arguments.json:
         print(json.dumps(result))
@@ -58,3 +82,21 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.video is not None and first is not None:
         write_video(first, arguments.video, config.simulator)
     return 0
+
+
+def _jobs(config: Config, arguments: argparse.Namespace) -> list[Job]:
+    if arguments.states and arguments.out is None:
+        raise UserError("--states stand in the rollouts; say with --out where those are recorded")
+    if arguments.situation is None:
+        jobs = trial_jobs(config, arguments.trials, arguments.seed, arguments.out)
+    else:
+        situations = [parse_situation(text) for text in arguments.situation]
+        for situation in situations:
+            make_task(config.task).check(situation)
+        jobs = situation_jobs(situations, arguments.seed, arguments.out)
+    return [replace(job, states=arguments.states) for job in jobs]
+
+
+def _write_outcomes(path: Path, trials: Iterable[CountedTrial]) -> None:
+    with written_whole(path) as stream:
+        stream.writelines(trial.line() for trial in sorted(trials, key=lambda trial: trial.seed))

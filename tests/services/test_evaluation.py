@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 
 from actors.tasks.experiment1 import Experiment1
+from learner.policy import NetworkPolicy
 from proto.config import Config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.recording import read_episode
 from services.cli import main
-from services.evaluation import trial_jobs
+from services.evaluation import parse_situation, trial_jobs
 from services.playing import play_all
-from services.success import wilson95
+from services.success import Tally, wilson95
+from services.trial_book import read_trials
 
 
 def evaluate(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
@@ -79,6 +81,41 @@ def test_pictures_and_workers_change_nothing(tmp_path: Path) -> None:
             assert other.outcome == episode.outcome
 
 
+def test_given_situations_are_played_and_their_states_kept(
+    checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    situation = "obstacle_x_m=-0.27,object_y_m=0.25,object_yaw_deg=44"
+    words = f"--policy {checkpoint} --situation {situation} --seed 7 --states --out {tmp_path}"
+    assert evaluate(capsys, *words.split())["trials"] == 1
+    episode = read_episode(tmp_path / "trial0000.mcap")
+    assert episode.situation == parse_situation(situation)
+    assert episode.seed == 7
+    assert episode.states is not None
+    units = {name: activity.shape for name, activity in episode.states.items()}
+    assert units == {
+        "mstnn_fast": (episode.steps, 3 * 18 * 22),
+        "mstnn_slow": (episode.steps, 6 * 7 * 8),
+        "pfc": (episode.steps, 20),
+        "mtrnn_slow": (episode.steps, 30),
+        "mtrnn_fast": (episode.steps, 50),
+    }
+    again = NetworkPolicy.from_file(checkpoint).states(episode.images)
+    assert all(np.array_equal(again[name], episode.states[name]) for name in units)
+
+
+def test_outcomes_are_kept_without_rollouts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "outcomes.jsonl"
+    result = evaluate(capsys, *f"--policy replay --trials 3 --seed 9 --outcomes {path}".split())
+    trials = read_trials(path)
+    assert [trial.situation for trial in trials] == [Experiment1().sample(9 + i) for i in range(3)]
+    assert [trial.seed for trial in trials] == [9, 10, 11]
+    assert {trial.run_id for trial in trials} == {"replay"}
+    kept = Tally.of(trial.outcome for trial in trials).as_json()
+    assert all(result[name] == value for name, value in kept.items())
+
+
 def by_seed(config: Config, workers: int, folder: Path | None = None) -> dict[int, Episode]:
     played = play_all(config, "yaw-blind", trial_jobs(config, 2, 7, folder), workers=workers)
     return {job.seed: episode for job, episode in played}
@@ -98,6 +135,10 @@ def test_a_policy_that_is_not_there_is_named(workers: int) -> None:
         ("--policy tutor --backend nothing", "no backend 'nothing'"),
         ("--policy tutor --task experiment9", "task.name"),
         ("--policy tutor --set tutor.speed=3", "tutor.speed"),
+        ("--policy tutor --situation object_y_m", "write NAME=VALUE"),
+        ("--policy tutor --situation object_y_m=0.2", "a situation has"),
+        ("--policy tutor --states", "--out"),
+        ("--policy tutor --trials 1 --states --out /nowhere", "'tutor' has no states"),
     ],
 )
 def test_bad_input_says_what_to_do(
