@@ -202,13 +202,14 @@ class ActorProcess:
         return Assignment(Kind.PRACTICE, self._policy, self._task.sample(seed), seed)
 
     def _play(self, assignment: Assignment) -> Episode:
+        live_key = self._bus.keys.live(self._bus.id)
+
         def on_step(live: LiveStep) -> None:
             if self._lifecycle.stopping:
                 raise _StoppedError
             self._pace.add()
-            if self._config.actor.live:
-                message = live_message(self._bus.id, assignment, live)
-                self._bus.publish(self._bus.keys.live(self._bus.id), message)
+            if self._config.actor.live and self._bus.watched(live_key):
+                self._bus.publish(live_key, live_message(self._bus.id, assignment, live))
 
         return play(
             self._simulator,

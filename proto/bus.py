@@ -135,6 +135,7 @@ class Bus:
         self._session = session
         self._declared: list[Any] = []  # Zenoh undeclares what nobody refers to
         self._newest: dict[str, zenoh.ext.AdvancedPublisher] = {}
+        self._watched: dict[str, zenoh.Publisher] = {}
         self._complained_about: set[str] = set()
 
     def __enter__(self) -> Self:
@@ -152,6 +153,12 @@ class Bus:
         """Leave; may be called again."""
         if not self._session.is_closed():
             self._session.close()  # type: ignore[no-untyped-call]
+
+    def watched(self, key: str) -> bool:
+        """Whether anyone subscribes to a key, as far as this process knows by now."""
+        if key not in self._watched:
+            self._watched[key] = self._session.declare_publisher(key)
+        return self._watched[key].matching_status.matching
 
     def publish(self, key: str, message: Any) -> None:
         """Publish a message that may be lost."""

@@ -23,6 +23,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import cached_property
 from typing import Annotated, Any, Final, Literal, Protocol, TypeVar, get_args, get_origin
 
 import msgpack
@@ -200,6 +201,14 @@ class Array:
     least: float = -math.inf
     most: float = math.inf
 
+    @cached_property
+    def _own(self) -> np.dtype[Any]:
+        return np.dtype(self.dtype)
+
+    @cached_property
+    def _wire(self) -> np.dtype[Any]:
+        return self._own.newbyteorder("<")
+
     def pack(self, value: NDArray[Any]) -> Plain:
         array = np.asarray(value)
         content = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
@@ -214,12 +223,11 @@ class Array:
         self._check_shape(shape, where, sizes)
         if not isinstance(content, bytes):
             raise MessageError(where, f"expected bytes as content, got {_kind(content)}")
-        kind = np.dtype(self.dtype).newbyteorder("<")
-        expected = math.prod(shape) * kind.itemsize
+        expected = math.prod(shape) * self._wire.itemsize
         if len(content) != expected:
             raise MessageError(where, f"expected {expected} bytes, got {len(content)}")
         # the copy is writable and in the machine's own byte order
-        array = np.frombuffer(content, kind).reshape(shape).astype(self.dtype)
+        array = np.frombuffer(content, self._wire).reshape(shape).astype(self._own)
         self._check_range(array, where)
         return array
 
@@ -238,12 +246,14 @@ class Array:
         return f"[{', '.join(names)}]"
 
     def _check_range(self, array: NDArray[Any], where: str) -> None:
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
+        if array.size == 0:
+            return
+        lowest, highest = float(array.min()), float(array.max())  # NaN if there is one
+        if not (math.isfinite(lowest) and math.isfinite(highest)):
             raise MessageError(where, "expected finite numbers, got NaN or infinity")
-        if array.size and not (self.least <= array.min() and array.max() <= self.most):
+        if not (self.least <= lowest and highest <= self.most):
             raise MessageError(
-                where,
-                f"expected {self.least:g}..{self.most:g}, got {array.min():g}..{array.max():g}",
+                where, f"expected {self.least:g}..{self.most:g}, got {lowest:g}..{highest:g}"
             )
 
 

@@ -71,7 +71,7 @@ class ActorConfig(_Section):
 
     Attributes:
         practice: play situations of one's own when nothing is asked for.
-        live: publish each step for whoever watches.
+        live: publish each step while anyone watches.
     """
 
     practice: bool = True

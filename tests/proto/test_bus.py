@@ -92,6 +92,17 @@ def test_messages_arrive_in_order_whole_and_once(shared: Network) -> None:
     assert inbox.take(timeout_s=0.1) is None
 
 
+def test_a_key_is_watched_as_long_as_someone_subscribes(shared: Network) -> None:
+    sender = shared.join(Role.ACTOR, "watched")
+    key = KEYS.live("watched")
+    assert not sender.watched(key)
+    with shared.join(Role.WATCH, "onlooker") as onlooker:
+        onlooker.subscribe(KEYS.live(), lambda _: None, Receipt)
+        eventually(lambda: sender.watched(key), "the onlooker is noticed")
+        assert not sender.watched(KEYS.sequence("watched"))
+    eventually(lambda: not sender.watched(key), "that it is gone is noticed")
+
+
 def test_a_full_inbox_drops_the_oldest_and_says_so(shared: Network) -> None:
     sender, reader = shared.join(Role.LEARNER, "l2"), shared.join(Role.ACTOR, "full")
     inbox = reader.inbox(KEYS.receipt("full"), Receipt, capacity=3)
@@ -118,8 +129,8 @@ def test_a_bad_message_is_counted_logged_once_and_harms_nothing(
         stranger.put(key, b"\xc1" * 100, encoding=wire.encoding, attachment=b"{")
         stranger.put(key, bytes(100_000), encoding=wire.encoding)
         stranger.delete(key)
-        sender.publish(key, TutoringCase(1, 2))
-        sender.publish(key, TutoringCase(1, 3))
+        sender.publish(key, TutoringCase("experiment1", 1, 2))
+        sender.publish(key, TutoringCase("experiment1", 1, 3))
         eventually(lambda: reader.refused == 7, "seven refused")
         stranger.put(key, wire.payload, encoding=wire.encoding)
         sender.deliver(key, Receipt("fine"))
@@ -160,7 +171,7 @@ def test_a_callback_that_fails_does_not_end_the_subscription(shared: Network) ->
 
 def test_questions_are_answered_with_a_message_or_with_nothing(shared: Network) -> None:
     learner, actor = shared.join(Role.LEARNER, "asked"), shared.join(Role.ACTOR, "asking")
-    cases = [TutoringCase(3, 1)]
+    cases = [TutoringCase("experiment1", 3, 1)]
 
     def hand_out(request: TutoringRequest) -> TutoringCase | None:
         if request.actor == "fail":
@@ -172,7 +183,10 @@ def test_questions_are_answered_with_a_message_or_with_nothing(shared: Network) 
     def ask(name: str) -> list[TutoringCase]:
         return actor.ask(KEYS.request_tutoring, TutoringRequest(name), TutoringCase)
 
-    eventually(lambda: ask("fail") == [] and ask("asking") == [TutoringCase(3, 1)], "an answer")
+    eventually(
+        lambda: ask("fail") == [] and ask("asking") == [TutoringCase("experiment1", 3, 1)],
+        "an answer",
+    )
     assert ask("asking") == []
     assert actor.ask(KEYS.request_tutoring, TrialRequest("a", "b", 1), TutoringCase) == []
     assert learner.refused == 1
@@ -216,7 +230,9 @@ def test_everything_comes_back_after_the_hub_was_killed() -> None:
         presence: list[tuple[str, bool]] = []
         actor.announce()
         learner.watch_presence(Role.ACTOR, lambda name, alive: presence.append((name, alive)))
-        learner.answer(KEYS.request_tutoring, TutoringRequest, lambda _: TutoringCase(0, 0))
+        learner.answer(
+            KEYS.request_tutoring, TutoringRequest, lambda _: TutoringCase("experiment1", 0, 0)
+        )
         actor.subscribe_newest(KEYS.policy, lambda new: versions.append(new.version), PolicyVersion)
         learner.publish_newest(KEYS.policy, policy(1))
         eventually(lambda: versions == [1] and presence == [("actor", True)], "the beginning")
