@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 from rich.console import Console
@@ -16,12 +14,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from learner.checkpoint import policy_file, training_file
 from learner.offline import open_training, run_training
-from learner.store import TutoringStore
 from learner.training import Trainer
 from proto.action import ARM, FOCUS, GRASP, NECK
-from proto.errors import UserError
 from proto.metrics import Stage
 from services.commands.options import add_config, config_of
+from services.commands.training_options import add_training_data, interruption, training_stores
 
 _INTERRUPTED: Final = 130
 _LINE_PERIOD_S: Final = 5.0
@@ -30,10 +27,7 @@ _LINE_PERIOD_S: Final = 5.0
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
     add_config(parser)
-    parser.add_argument("--data", type=Path, required=True, help="folder of tutored sequences")
-    parser.add_argument(
-        "--pretraining-data", type=Path, help="folder of sequences for pre-training, if others"
-    )
+    add_training_data(parser)
     parser.add_argument(
         "--out", type=Path, required=True, help="folder of the run; goes on with the one in it"
     )
@@ -42,17 +36,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Train until done or Ctrl-C; either way the run's folder holds all that was learned."""
     config = config_of(arguments)
-    store = _filled_store("--data", arguments.data)
-    others = None
-    if arguments.pretraining_data is not None:
-        others = _filled_store("--pretraining-data", arguments.pretraining_data)
+    store, others = training_stores(arguments)
     folder: Path = arguments.out
     trainer = open_training(config, folder, store, others)
     config.save(folder / "config.yaml")
     if trainer.finished:
         print(f"{folder} is trained already; learner.epochs above {trainer.epochs_done} goes on")
         return 0
-    with _interruption() as interrupted, _progress(trainer) as show:
+    with interruption() as interrupted, _progress(trainer) as show:
 
         def go_on(loss: float) -> bool:
             show(loss)
@@ -64,35 +55,6 @@ def run(arguments: argparse.Namespace) -> int:
         return _INTERRUPTED
     _print_summary(trainer, folder)
     return 0
-
-
-def _filled_store(option: str, folder: Path) -> TutoringStore:
-    if not folder.is_dir():
-        raise UserError(f"{option} {folder} is no folder; record one with `vmdnn tutor --out DIR`")
-    store = TutoringStore(folder)
-    if not store.ids:
-        raise UserError(
-            f"{option} {folder} holds no sequence (*.mcap); record some with"
-            " `vmdnn tutor --out DIR`"
-        )
-    return store
-
-
-@contextmanager
-def _interruption() -> Iterator[Callable[[], bool]]:
-    """Tell whether Ctrl-C was pressed, so that an epoch can end; a second one ends at once."""
-    pressed = False
-
-    def note(_signal: int, _frame: FrameType | None) -> None:
-        nonlocal pressed
-        pressed = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    before = signal.signal(signal.SIGINT, note)
-    try:
-        yield lambda: pressed
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
