@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from learner.captured import CapturedUpdates
 from learner.divergence import divergence, reference_divergence
 from learner.kernels.library import peak_flops
 from learner.loss import kl_divergence
@@ -28,7 +29,7 @@ from proto.config import Config, NetworkConfig
 from proto.errors import UserError
 from proto.machine import machine_name
 
-Epoch = Callable[[], None]
+Epoch = Callable[[], object]
 
 MEASURING_S: Final = 12.0
 TURN_S: Final = 0.1
@@ -112,7 +113,7 @@ def bench_bptt(
     fused = functools.partial(divergence, network, sequences)
     contenders = {
         "eager": _epoch(by_loop, network.core_parameters(), sequences),
-        "fused": _epoch(fused, network.core_parameters(), sequences),
+        "fused": _epoch(fused, network.core_parameters(), sequences, captured=where.type == "cuda"),
         "autograd by hand": _epoch(by_hand, network.core_parameters(), sequences),
         "nn.LSTM": _peer_epoch(_Lstm, network, sequences),
         "MTRNN cell": _peer_epoch(_Mtrnn, network, sequences),
@@ -171,20 +172,25 @@ def _sequences(network: VMDNN, batch: int, steps: int) -> Sequences:
 
 
 def _epoch(
-    loss: Callable[[Tensor], Tensor], parameters: Sequence[nn.Parameter], sequences: Sequences
+    loss: Callable[[Tensor], Tensor],
+    parameters: Sequence[nn.Parameter],
+    sequences: Sequences,
+    *,
+    captured: bool = False,
 ) -> Epoch:
     """What training does in an epoch whose sequences fit into one minibatch."""
-    adam = torch.optim.Adam(parameters, 1e-4, fused=True)
+    adam = torch.optim.Adam(parameters, 1e-4, fused=True, capturable=captured)
     everything = torch.arange(len(sequences.mask), device=sequences.mask.device)
 
-    def epoch() -> None:
+    def update(chosen: Tensor) -> Tensor:
         adam.zero_grad()
-        value = loss(everything)
+        value = loss(chosen)
         value.backward()  # type: ignore[no-untyped-call]
         adam.step()
-        value.item()
+        return value
 
-    return epoch
+    updates = CapturedUpdates(update) if captured else update
+    return lambda: updates(everything).item()
 
 
 def _medians_ms(contenders: Mapping[str, Epoch], limit_s: float) -> dict[str, float]:

@@ -156,7 +156,7 @@ class _Scan(torch.autograd.Function):
         delayed: Tensor,
         *immediate: Tensor,
     ) -> Tensor:
-        run = gpu.run if gpu.serves(drive) else _run
+        run = gpu.run if gpu.serves(drive, immediate) else _run
         hidden = run(drive, keep, initial, delayed, immediate)
         ctx.save_for_backward(hidden, initial, keep, delayed, *immediate)
         return hidden
@@ -165,7 +165,7 @@ class _Scan(torch.autograd.Function):
     def backward(ctx: FunctionCtx, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         (by_hidden,) = gradients
         hidden, initial, keep, delayed, *immediate = ctx.saved_tensors  # type: ignore[attr-defined]
-        run_back = gpu.run_back if gpu.serves(hidden) else _run_back
+        run_back = gpu.run_back if gpu.serves(hidden, immediate) else _run_back
         deltas = run_back(by_hidden, hidden, keep, delayed, immediate)
         spans = _spans(delayed, immediate)
         rest = torch.tanh(initial)

@@ -1,9 +1,9 @@
 """The recurrent scan in Triton; `learner.kernels.gpu` calls it.
 
-One program runs one sequence through all steps. It holds the weights, as two square matrices of all
-units, and the state in registers; of each step it only reads the drive and writes the activity.
-Within a step a level acts on the next one: after as many sweeps over all units as there are such
-levels, all are right.
+One program runs one sequence through all steps. It holds the weights and the state in registers; of
+each step it only reads the drive and writes the activity. Units of up to three levels are stacked,
+the second level from unit SECOND on and the third from THIRD. Within a step each acts on the next,
+so that they are computed one after the other.
 """
 
 import triton
@@ -34,10 +34,17 @@ def _product(weights, x):
 
 
 @triton.jit
-def _square(matrix, unit, units):
-    real = unit < units
-    at = unit[:, None] * units + unit[None, :]
-    return tl.load(matrix + at, mask=real[:, None] & real[None, :], other=0.0)
+def _matrix(matrix, unit, units, COLUMNS: tl.constexpr):
+    """Weights (units, COLUMNS), filled up with zeros."""
+    at = unit[:, None] * COLUMNS + tl.arange(0, COLUMNS)[None, :]
+    return tl.load(matrix + at, mask=(unit < units)[:, None], other=0.0)
+
+
+@triton.jit
+def _of_level(x, START: tl.constexpr, COUNT: tl.constexpr):
+    """COUNT numbers of x from START on; beyond its end, any."""
+    size: tl.constexpr = x.shape[0]
+    return tl.gather(x, tl.minimum(START + tl.arange(0, COUNT), size - 1), axis=0)
 
 
 @triton.jit
@@ -45,20 +52,25 @@ def run(
     drive,  # (B, T, N)
     keep,  # (N,)
     initial,  # (B, N)
-    delayed,  # (N, N), to x from
-    immediate,  # (N, N)
+    delayed,  # (N, PADDED), to x from
+    immediate,  # (N, WIDTH), to x from the level before
     hidden,  # (B, T, N), written
     steps,
     units,
-    SWEEPS: tl.constexpr,
+    LEVELS: tl.constexpr,
+    SECOND: tl.constexpr,
+    THIRD: tl.constexpr,
     PADDED: tl.constexpr,
+    WIDTH: tl.constexpr,
 ):
     """Activity h = tanh(v), v[t] = keep v[t-1] + drive[t] + delayed h[t-1] + immediate h[t]."""
     sequence = tl.program_id(0)
     unit = tl.arange(0, PADDED)
     real = unit < units
-    by_delayed = _square(delayed, unit, units)
-    by_immediate = _square(immediate, unit, units)
+    second = (unit >= SECOND) & (unit < THIRD)
+    third = unit >= THIRD
+    by_delayed = _matrix(delayed, unit, units, PADDED)
+    by_immediate = _matrix(immediate, unit, units, WIDTH)
     kept = tl.load(keep + unit, mask=real, other=0.0)
     potential = tl.load(initial + sequence * units + unit, mask=real, other=0.0)
     activity = _tanh(potential)
@@ -67,11 +79,15 @@ def run(
     now = tl.load(drive + at, mask=real, other=0.0)
     for _step in range(steps):
         following = tl.load(drive + at + units, mask=real & (at + units < end), other=0.0)
-        delivered = kept * potential + now + _product(by_delayed, activity)
-        potential = delivered
+        potential = kept * potential + now + _product(by_delayed, activity)
         activity = _tanh(potential)
-        for _ in tl.static_range(SWEEPS):
-            potential = delivered + _product(by_immediate, activity)
+        if LEVELS > 1:
+            within = _product(by_immediate, _of_level(activity, 0, WIDTH))
+            potential += tl.where(second, within, 0.0)
+            activity = _tanh(potential)
+        if LEVELS > 2:
+            within = _product(by_immediate, _of_level(activity, SECOND, WIDTH))
+            potential += tl.where(third, within, 0.0)
             activity = _tanh(potential)
         tl.store(hidden + at, activity, mask=real)
         now = following
@@ -83,22 +99,27 @@ def run_back(
     by_hidden,  # (B, T, N)
     hidden,  # (B, T, N)
     keep,  # (N,)
-    delayed_back,  # (N, N), from x to
-    immediate_back,  # (N, N)
+    delayed_back,  # (N, PADDED), from x to
+    immediate_back,  # (N, WIDTH), from x to the level after
     deltas,  # (B, T, N), written
     steps,
     units,
-    SWEEPS: tl.constexpr,
+    LEVELS: tl.constexpr,
+    SECOND: tl.constexpr,
+    THIRD: tl.constexpr,
     PADDED: tl.constexpr,
+    WIDTH: tl.constexpr,
 ):
     """What h changes, by v: deltas[t] = keep deltas[t+1] + (1 - h[t]^2) dE/dh[t]."""
     sequence = tl.program_id(0)
     unit = tl.arange(0, PADDED)
     real = unit < units
-    by_delayed = _square(delayed_back, unit, units)
-    by_immediate = _square(immediate_back, unit, units)
+    first = unit < SECOND
+    second = (unit >= SECOND) & (unit < THIRD)
+    by_delayed = _matrix(delayed_back, unit, units, PADDED)
+    by_immediate = _matrix(immediate_back, unit, units, WIDTH)
     kept = tl.load(keep + unit, mask=real, other=0.0)
-    after = tl.zeros_like(kept)
+    delta = tl.zeros_like(kept)
     begin = sequence * steps * units
     at = begin + (steps - 1) * units + unit
     wanted = tl.load(by_hidden + at, mask=real, other=0.0)
@@ -108,12 +129,14 @@ def run_back(
         wanted_before = tl.load(by_hidden + at - units, mask=earlier, other=0.0)
         activity_before = tl.load(hidden + at - units, mask=earlier, other=0.0)
         slope = 1.0 - activity * activity
-        arriving = wanted + _product(by_delayed, after)
-        delta = kept * after + slope * arriving
-        for _ in tl.static_range(SWEEPS):
-            delta = kept * after + slope * (arriving + _product(by_immediate, delta))
+        delta = kept * delta + slope * (wanted + _product(by_delayed, delta))
+        if LEVELS > 2:
+            within = slope * _product(by_immediate, _of_level(delta, THIRD, WIDTH))
+            delta += tl.where(second, within, 0.0)
+        if LEVELS > 1:
+            within = slope * _product(by_immediate, _of_level(delta, SECOND, WIDTH))
+            delta += tl.where(first, within, 0.0)
         tl.store(deltas + at, delta, mask=real)
-        after = delta
         wanted = wanted_before
         activity = activity_before
         at -= units

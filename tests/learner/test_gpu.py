@@ -70,7 +70,7 @@ def test_the_scan_runs_on_the_gpu() -> None:
     drive, keep, _, delayed, *immediate = to_kernel(
         problem([20, 30, 50], within_step=True, steps=130, batch=45)
     )
-    assert gpu.serves(drive)
+    assert gpu.serves(drive, immediate)
     results = []
     for device in ("cpu", "cuda"):
         leaves = [
