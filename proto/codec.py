@@ -334,7 +334,7 @@ class Record:
 
     def unpack(self, plain: Plain, where: str, sizes: Sizes) -> Any:
         if not isinstance(plain, dict):
-            raise MessageError(where, f"expected a map of fields, got {_kind(plain)}")
+            raise MessageError(where or "payload", f"expected a map of fields, got {_kind(plain)}")
         for name in plain:
             if name not in self.fields:
                 raise MessageError(_path(where, f"{name!a:.64}"), "is not a field of this message")
