@@ -47,7 +47,9 @@ class ActorSpeed:
         backend: name of the simulator.
         physics_ms: time of one physics step.
         render_ms: time of one observation, rendering and all.
-        network_ms: time of one step of the network.
+        network_ms: time of one step of the network, from picture to action, as it acts.
+        network_numpy_ms: the same in numpy, as it acts where nothing can be compiled.
+        core_ms: the part of `network_ms` that PFC, M_S, M_F and M_O take.
         steps_per_s: control steps per second of the actor's whole loop.
         ratio: processor time of one step of the whole loop over that of the bare simulator doing
             the same; waiting, such as for a core that others use, does not count.
@@ -59,6 +61,8 @@ class ActorSpeed:
     physics_ms: float
     render_ms: float
     network_ms: float
+    network_numpy_ms: float
+    core_ms: float
     steps_per_s: float
     ratio: float
     episode_s: float
@@ -78,7 +82,9 @@ def bench_actor(config: Config) -> ActorSpeed:
     task = make_task(config.task)
     situation = task.tutored()[len(task.tutored()) // 2]
     tutor = make_tutor(config, noisy=False)
-    pupil = _Pupil(random_network(config.network), plan(situation))
+    checkpoint = random_checkpoint(config.network)
+    pupil = _Pupil(NetworkPolicy(checkpoint, "the benchmark"), plan(situation))
+    others = _OtherNetworks(checkpoint)
     tutored = _Laps()
     with (
         closing(make_simulator(config.simulator)) as simulator,
@@ -99,6 +105,8 @@ def bench_actor(config: Config) -> ActorSpeed:
         physics_ms=1e3 * median(shadow.physics) / config.simulator.substeps,
         render_ms=1e3 * median(shadow.render),
         network_ms=1e3 * median(pupil.network_laps),
+        network_numpy_ms=1e3 * median(others.numpy_laps),
+        core_ms=1e3 * median(others.core_laps),
         steps_per_s=1.0 / median(shadow.whole_loop),
         ratio=median(shadow.whole_work) / median(shadow.bare_work),
         episode_s=median(tutored),
@@ -151,7 +159,25 @@ class _Pupil:
         return next(self._next)
 
 
-def random_network(config: NetworkConfig) -> NetworkPolicy:
+class _OtherNetworks:
+    """The network again, in numpy and in parts, to be measured beside the one that acts."""
+
+    def __init__(self, checkpoint: Checkpoint) -> None:
+        self.numpy_laps, self.core_laps = _Laps(), _Laps()
+        parameters = cast("Parameters", checkpoint.part(NETWORK_PREFIX))
+        self._numpy = NetworkPolicy(checkpoint, "the benchmark", SteppingNetwork)
+        self._parts = make_acting_network(checkpoint.metadata.network, parameters)
+
+    def step(self, image: Image) -> None:
+        """One step of each."""
+        with self.numpy_laps:
+            self._numpy.step(image)
+        seen = self._parts.see(vision_input(image))
+        with self.core_laps:
+            self._parts.act(seen)
+
+
+def random_checkpoint(config: NetworkConfig) -> Checkpoint:
     """A network of the configured sizes that has learned nothing."""
     rng = np.random.default_rng(0)
     tensors = {
@@ -171,7 +197,7 @@ def random_network(config: NetworkConfig) -> NetworkPolicy:
             maxima=tuple(value.maximum for value in ACTION_VALUES),
         ),
     )
-    return NetworkPolicy(Checkpoint(metadata, tensors), "the network of the benchmark")
+    return Checkpoint(metadata, tensors)
 
 
 class _Shadow:
@@ -213,7 +239,7 @@ def _play(
     shadow: _Shadow | None = None,
 ) -> None:
     """An episode as the actor's process plays it, but for the wire itself."""
-    assignment = Assignment(Kind.TRIAL, policy, situation, seed=0)
+    assignment = Assignment(Kind.TRIAL, task, policy, situation, seed=0)
 
     def on_step(live: LiveStep) -> None:
         encode(live_message("bench", assignment, live))

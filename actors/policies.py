@@ -28,6 +28,7 @@ def _nearest(value: float, grid: tuple[float, ...]) -> float:
 
 
 _MIDDLE: Final = {"obstacle_x_m": -0.27, "object_y_m": 0.25, "object_yaw_deg": 0.0}
+"""The middle of the ranges; also what is planned for where a situation lacks a value."""
 
 BASELINES: Final[Mapping[str, Belief]] = {
     # one fixed sequence, whatever the situation
@@ -62,7 +63,7 @@ class PlannedPolicy:
 
     def begin(self, situation: Situation, seed: int) -> None:
         """Plan the episode; `seed` is that of the execution noise."""
-        self._plan = plan(self._belief(situation))
+        self._plan = plan(self._belief({**_MIDDLE, **situation}))
         self._actions = self._plan
         if self._noise is not None:
             self._actions = self._plan + execution_noise(

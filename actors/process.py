@@ -15,8 +15,8 @@ from actors.player import LiveStep, play
 from actors.policies import make_tutor
 from actors.policy import Policy
 from actors.simulator import make_simulator
-from actors.tasks.registry import make_task
-from actors.tasks.task import Situation
+from actors.tasks.registry import TASKS, make_task
+from actors.tasks.task import Situation, Task
 from learner.policy import NetworkPolicy
 from proto.bus import Bus
 from proto.codec import MessageError, encode
@@ -55,12 +55,14 @@ class Assignment:
 
     Attributes:
         kind: why.
+        task: what is played.
         policy: who acts.
         situation: in which situation.
         seed: seed of the episode.
     """
 
     kind: Kind
+    task: Task
     policy: Policy
     situation: Situation
     seed: int
@@ -99,7 +101,7 @@ class ActorProcess:
         self._lifecycle = lifecycle
         self._digest = config.digest()
         self._task = make_task(config.task)
-        self._tutored = self._task.tutored()
+        self._tutored = {name: make() for name, make in TASKS.items()}
         self._simulator = make_simulator(config.simulator)
         outbox = config.run_folder / "outbox" / bus.id
         self._sequences = Outbox(outbox / "sequences", bus.deliver_wire)
@@ -175,11 +177,12 @@ class ActorProcess:
             return None
         request = TutoringRequest(self._bus.id)
         for answer in self._bus.ask(self._bus.keys.request_tutoring, request, TutoringCase):
-            if answer.case >= len(self._tutored):
-                LOG.warning("the learner asks for case %d, which there is not", answer.case)
+            task = self._tutored.get(answer.task)
+            if task is None or answer.case >= len(task.tutored()):
+                LOG.warning("the learner asks for %s, which there is not", answer)
                 continue
-            policy = make_tutor(self._config, noisy=answer.repeat > 0)
-            return Assignment(Kind.TUTORING, policy, self._tutored[answer.case], answer.seed)
+            policy, case = make_tutor(self._config, noisy=answer.repeat > 0), answer.case
+            return Assignment(Kind.TUTORING, task, policy, task.tutored()[case], answer.seed)
         return None
 
     def _trial(self) -> Assignment | None:
@@ -189,7 +192,7 @@ class ActorProcess:
         request = TrialRequest(self._bus.id, self._policy_run, self._policy.version)
         for trial in self._bus.ask(self._bus.keys.request_trial, request, Trial):
             situation = self._task.sample(trial.seed)
-            return Assignment(Kind.TRIAL, self._policy, situation, trial.seed)
+            return Assignment(Kind.TRIAL, self._task, self._policy, situation, trial.seed)
         return None
 
     def _practice(self) -> Assignment | None:
@@ -199,7 +202,8 @@ class ActorProcess:
         if len(self._rollouts) >= PRACTICE_LIMIT:
             return None
         seed = secrets.randbits(31)
-        return Assignment(Kind.PRACTICE, self._policy, self._task.sample(seed), seed)
+        situation = self._task.sample(seed)
+        return Assignment(Kind.PRACTICE, self._task, self._policy, situation, seed)
 
     def _play(self, assignment: Assignment) -> Episode:
         live_key = self._bus.keys.live(self._bus.id)
@@ -213,7 +217,7 @@ class ActorProcess:
 
         return play(
             self._simulator,
-            self._task,
+            assignment.task,
             assignment.policy,
             assignment.situation,
             seed=assignment.seed,

@@ -232,6 +232,11 @@ def training_file(run_folder: Path) -> Path:
     return run_folder / "checkpoints" / "training.safetensors"
 
 
+def pretraining_file(run_folder: Path) -> Path:
+    """Where a run keeps the training as it was when pre-training was over, with its classifier."""
+    return run_folder / "checkpoints" / "pretraining.safetensors"
+
+
 def policy_file(run_folder: Path, version: int) -> Path:
     """Where a run keeps a policy version."""
     return run_folder / "policies" / f"{version:06d}.safetensors"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 
 from proto.config import Config
 from proto.episode import Episode, Kind
@@ -14,33 +15,33 @@ from proto.messages import TutoringCase
 class Curriculum:
     """Hands out each case once; again when it was not shown in time. Used by several threads.
 
-    The clean executions of all cases come first: what is learned from first is most different.
+    The cases of pre-training come first, if they are of another task, then those of the task. Of
+    either the clean executions of all cases come first: what is learned from first is most
+    different.
 
     Attributes:
-        size: number of sequences there will be.
+        sizes: number of sequences that there will be, by the name of their task.
     """
 
-    def __init__(self, config: Config, tutored_cases: int) -> None:
-        """Plan what the configuration asks for, of a task with so many tutored cases.
+    def __init__(self, config: Config, tutored_cases: Mapping[str, int]) -> None:
+        """Plan what the configuration asks for.
+
+        Args:
+            config: the configuration.
+            tutored_cases: number of tutored cases of each task, by name.
 
         Raises:
             UserError: the configuration names a case that the task does not have.
         """
-        cases = range(tutored_cases) if config.learner.cases is None else config.learner.cases
-        wrong = [case for case in cases if case >= tutored_cases]
-        if wrong:
-            raise UserError(
-                f"learner.cases: there is no case {wrong[0]}; the task {config.task.name} has "
-                f"the tutored cases 0 to {tutored_cases - 1}"
-            )
-        planned = [
-            TutoringCase(case, repeat)
-            for repeat in range(config.tutor.repeats)
-            for case in dict.fromkeys(cases)
-        ]
-        self.size = len(planned)
-        self._task = config.task.name
-        self._missing = {case.seed: case for case in planned}  # in the order of the plan
+        planned = []
+        if config.pretraining_task is not None:
+            task, first = config.pretraining_task, config.learner.pretraining
+            option = "learner.pretraining.cases"
+            planned += _plan(task, tutored_cases[task], first.cases, first.repeats, option)
+        task, cases = config.task.name, config.learner.cases
+        planned += _plan(task, tutored_cases[task], cases, config.tutor.repeats, "learner.cases")
+        self.sizes = Counter(case.task for case in planned)
+        self._missing = {_name(case): case for case in planned}  # in the order of the plan
         self._leases: Leases[TutoringCase] = Leases(config.learner.lease_s)
 
     @property
@@ -59,11 +60,33 @@ class Curriculum:
 
     def wants(self, episode: Episode) -> bool:
         """Whether an episode shows a case that is still missing."""
-        ours = episode.kind is Kind.TUTORING and episode.task == self._task
-        return ours and episode.seed in self._missing
+        return episode.kind is Kind.TUTORING and _name(episode) in self._missing
 
     def shown(self, episodes: Iterable[Episode]) -> None:
         """These episodes are kept: their cases need not be shown any more."""
         for episode in episodes:
             if self.wants(episode):
-                self._leases.finish(self._missing.pop(episode.seed))
+                self._leases.finish(self._missing.pop(_name(episode)))
+
+
+def _name(case: TutoringCase | Episode) -> tuple[str, int]:
+    """What a case has in common with the episode that shows it."""
+    return case.task, case.seed
+
+
+def _plan(
+    task: str, tutored_cases: int, cases: Sequence[int] | None, repeats: int, option: str
+) -> list[TutoringCase]:
+    """So many repeats of some cases of a task, None for all; `option` is where they come from."""
+    wanted = range(tutored_cases) if cases is None else cases
+    wrong = [case for case in wanted if case >= tutored_cases]
+    if wrong:
+        raise UserError(
+            f"{option}: there is no case {wrong[0]}; the task {task} has the tutored cases "
+            f"0 to {tutored_cases - 1}"
+        )
+    return [
+        TutoringCase(task, case, repeat)
+        for repeat in range(repeats)
+        for case in dict.fromkeys(wanted)
+    ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from learner.checkpoint import policy_file, training_file
+from learner.checkpoint import policy_file, pretraining_file, training_file
 from learner.store import TutoringStore
 from learner.training import Trainer
 from proto.config import Config, LearnerConfig
@@ -44,11 +44,18 @@ def run_training(
     going = True
     while going and not trainer.finished:
         going = go_on(trainer.epoch())
+        if pretraining_is_over(trainer):
+            trainer.save(pretraining_file(folder))
         if policy_is_due(trainer, config):
             write_policy(trainer, folder)
         if trainer.epochs_done % config.checkpoint_every_epochs == 0:
             trainer.save(training_file(folder))
     trainer.save(training_file(folder))
+
+
+def pretraining_is_over(trainer: Trainer) -> bool:
+    """Whether the epoch that was just done was the last one of pre-training."""
+    return trainer.next_stage is not trainer.stage
 
 
 def policy_is_due(trainer: Trainer, config: LearnerConfig) -> bool:

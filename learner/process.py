@@ -6,12 +6,14 @@ import logging
 import secrets
 import threading
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from learner.checkpoint import load_checkpoint, policy_file, training_file
+from learner.checkpoint import load_checkpoint, policy_file, pretraining_file, training_file
 from learner.curriculum import Curriculum
-from learner.offline import open_training, policy_is_due, write_policy
+from learner.offline import open_training, policy_is_due, pretraining_is_over, write_policy
 from learner.store import TutoringStore
 from proto.bus import Bus, Inbox
 from proto.config import Config
@@ -30,6 +32,23 @@ IDLE_S: Final = 0.2
 _TRAINING: Final = (Stage.PRETRAINING, Stage.COUPLED)
 
 
+@dataclass(frozen=True)
+class _Material:
+    """What a stage learns from.
+
+    Attributes:
+        store: its sequences.
+        start_with: so many of them are enough to start.
+    """
+
+    store: TutoringStore
+    start_with: int
+
+    @property
+    def enough(self) -> bool:
+        return len(self.store) >= self.start_with
+
+
 class LearnerProcess:
     """Restores first, publishes second: what it published before a restart it still knows.
 
@@ -37,7 +56,7 @@ class LearnerProcess:
     """
 
     def __init__(
-        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, tutored_cases: int
+        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, tutored_cases: Mapping[str, int]
     ) -> None:
         """Restore what is in the run's folder.
 
@@ -45,7 +64,7 @@ class LearnerProcess:
             config: the configuration of the run.
             bus: connection to the others.
             lifecycle: when to pause and to stop.
-            tutored_cases: number of tutored cases that the task has.
+            tutored_cases: number of tutored cases that each task has, by name.
 
         Raises:
             UserError: the folder holds a training that cannot go on, or the configuration asks for
@@ -56,10 +75,16 @@ class LearnerProcess:
         self._lifecycle = lifecycle
         self._folder = config.run_folder
         self._curriculum = Curriculum(config, tutored_cases)
-        self._store = TutoringStore(self._folder / "tutoring")
-        self._curriculum.shown(filter(None, map(self._store.load, self._store.ids)))
-        self._start_with = min(config.learner.start_sequences, self._curriculum.size)
-        self._trainer = open_training(config, self._folder, self._store, None)
+        self._stores = _stores(config)
+        for store in self._stores.values():
+            self._curriculum.shown(filter(None, map(store.load, store.ids)))
+        self._materials = self._make_materials()
+        self._trainer = open_training(
+            config,
+            self._folder,
+            self._materials[Stage.COUPLED].store,
+            self._materials[Stage.PRETRAINING].store,
+        )
         self._training = threading.Lock()  # held while the trainer changes or is written to disk
         self._run_id = _run_id(self._folder)
         self._pace = Pace()
@@ -93,7 +118,7 @@ class LearnerProcess:
             epoch=self._trainer.epochs_done,
             epochs_total=self._trainer.epochs_total,
             loss=self._trainer.loss,
-            sequences=len(self._store),
+            sequences=self._sequences,
             epochs_per_s=self._pace.per_second(),
             policy_version=self._trainer.version,
             paused=self._lifecycle.paused,
@@ -108,13 +133,29 @@ class LearnerProcess:
             return f"saved {self._trainer.stage} epoch {self._trainer.epochs_done} to {path}"
 
     @property
+    def _sequences(self) -> int:
+        return sum(map(len, self._stores.values()))
+
+    @property
     def _stage(self) -> Stage:
-        waiting = len(self._store) < self._start_with and not self._trainer.finished
+        material = self._materials.get(self._trainer.next_stage)
+        waiting = material is not None and not material.enough
         return Stage.WAITING if waiting else self._trainer.stage
 
     @property
     def _may_train(self) -> bool:
         return self._stage in _TRAINING and not self._lifecycle.paused
+
+    def _make_materials(self) -> Mapping[Stage, _Material]:
+        """What coupled training and pre-training learn from."""
+        learner, sizes = self._config.learner, self._curriculum.sizes
+        task, first = self._config.task.name, self._config.pretraining_task
+        coupled = _Material(self._stores[task], min(learner.start_sequences, sizes[task]))
+        pretraining = coupled
+        if first is not None:
+            enough = min(learner.pretraining.start_sequences, sizes[first])
+            pretraining = _Material(self._stores[first], enough)
+        return {Stage.COUPLED: coupled, Stage.PRETRAINING: pretraining}
 
     def _open_doors(self) -> Inbox[Sequence]:
         """From now on sequences are received and cases handed out."""
@@ -134,9 +175,9 @@ class LearnerProcess:
         while (sequence := inbox.take(timeout_s=wait_s)) is not None:
             episode = sequence.episode
             if self._curriculum.wants(episode):
-                self._store.add(episode)
+                self._stores[episode.task].add(episode)
                 self._curriculum.shown([episode])
-                LOG.info("sequence %d of %d", len(self._store), self._curriculum.size)
+                LOG.info("sequence %d of %d", self._sequences, self._curriculum.sizes.total())
             # One that is not wanted, such as the second of a case, need not be sent again either.
             self._bus.deliver(self._bus.keys.receipt(episode.actor), Receipt(episode.id))
             wait_s = 0.0
@@ -144,6 +185,9 @@ class LearnerProcess:
     def _train(self) -> None:
         with self._training:
             self._trainer.epoch()
+            over = pretraining_is_over(self._trainer)
+            if over:
+                self._trainer.save(pretraining_file(self._folder))
         self._pace.add()
         if policy_is_due(self._trainer, self._config.learner):
             with self._training:
@@ -151,7 +195,7 @@ class LearnerProcess:
             # the training on disk knows of a version before anyone else does
             LOG.info(self.checkpoint())
             self._publish()
-        elif self._trainer.epochs_done % self._config.learner.checkpoint_every_epochs == 0:
+        elif over or self._trainer.epochs_done % self._config.learner.checkpoint_every_epochs == 0:
             LOG.info(self.checkpoint())
 
     def _publish(self) -> None:
@@ -173,6 +217,14 @@ class LearnerProcess:
             ),
         )
         LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
+
+
+def _stores(config: Config) -> Mapping[str, TutoringStore]:
+    """Where the sequences of each task are kept."""
+    folders = {config.task.name: "tutoring"}
+    if config.pretraining_task is not None:
+        folders[config.pretraining_task] = "pretraining"
+    return {task: TutoringStore(config.run_folder / name) for task, name in folders.items()}
 
 
 def _run_id(folder: Path) -> str:

@@ -84,7 +84,7 @@ class Trainer:
         torch.set_num_threads(config.learner.threads)
         self._config = config
         self._store = store
-        self._pretraining_store = pretraining_store or store
+        self._pretraining_store = store if pretraining_store is None else pretraining_store
         self._generator = torch.Generator().manual_seed(config.run.seed)
         self.network = VMDNN(config.network)
         self.network.initialize(
@@ -129,6 +129,12 @@ class Trainer:
         return self.stage is Stage.FINISHED
 
     @property
+    def next_stage(self) -> Stage:
+        """Stage of the next epoch."""
+        over = self.stage is Stage.PRETRAINING and self.epochs_done >= self.epochs_total
+        return Stage.COUPLED if over else self.stage
+
+    @property
     def epochs_total(self) -> int:
         """Epochs that this stage has."""
         return self._plan().epochs
@@ -146,8 +152,8 @@ class Trainer:
         """
         if self.finished:
             raise RuntimeError("the training is finished")
-        if self.stage is Stage.PRETRAINING and self.epochs_done >= self.epochs_total:
-            self._enter(Stage.COUPLED)
+        if self.next_stage is not self.stage:
+            self._enter(self.next_stage)
         self._take_in(self._intake.new())
         if self._optimization is None:
             raise UserError(self._intake.complaint())

@@ -40,10 +40,14 @@ class HubConfig(_Section):
     shared_memory: bool = False
 
 
+TaskName = Literal["experiment1", "reaching"]
+"""Experiment I, or the same without an obstacle, which the vision is pre-trained on."""
+
+
 class TaskConfig(_Section):
     """Which task is tutored and tested."""
 
-    name: Literal["experiment1"] = "experiment1"
+    name: TaskName = "experiment1"
 
 
 class SimulatorConfig(_Section):
@@ -138,8 +142,18 @@ class NetworkConfig(_Section):
 
 
 class PretrainingConfig(_Section):
-    """Pre-training of the MSTNN as a delayed-response classifier (section 3.3)."""
+    """Pre-training of the MSTNN as a delayed-response classifier (section 3.3).
 
+    On the bus the learner first asks the actors for the sequences of pre-training: each of `cases`
+    (indices of the tutored cases of `task`, None for all) `repeats` times. It starts with
+    `start_sequences` of them, or with all if they are fewer. Without a task of its own, and in
+    `vmdnn train` without --pretraining-data, the sequences of coupled training serve.
+    """
+
+    task: Literal["reaching"] | None = "reaching"
+    cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    repeats: Count = 4
+    start_sequences: Count = 15
     epochs: Annotated[int, Field(ge=0)] = 300
     rate: Positive = 2e-3
     batch: Count = 15
@@ -227,6 +241,12 @@ class Config(_Section):
     def run_folder(self) -> Path:
         """Folder of the run."""
         return self.run.folder / self.run.name
+
+    @property
+    def pretraining_task(self) -> TaskName | None:
+        """Task of the sequences of pre-training; None where those of coupled training serve."""
+        first = self.learner.pretraining
+        return None if first.epochs == 0 or first.task == self.task.name else first.task
 
     @model_validator(mode="after")
     def _can_be_done(self) -> Self:

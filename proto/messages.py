@@ -77,16 +77,18 @@ class TutoringRequest:
     actor: Id
 
 
-@message("tutoring_case", 1)
+@message("tutoring_case", 2)
 @dataclass(frozen=True)
 class TutoringCase:
     """A case to demonstrate.
 
     Attributes:
+        task: name of the task; that of pre-training is another than the one that is tested.
         case: index into the task's tutored situations.
         repeat: 0 for the clean plan, 1, 2, ... for executions with noise.
     """
 
+    task: Annotated[str, Text(64)]
     case: Count
     repeat: Count
 

@@ -94,7 +94,7 @@ class LearnerMetrics(Metrics):
         epoch: epochs done in this stage.
         epochs_total: epochs that this stage has.
         loss: loss of the last epoch; null at first.
-        sequences: tutored sequences in the store.
+        sequences: tutored sequences that it keeps, those of pre-training counted.
         epochs_per_s: epochs per second since the last metrics.
         policy_version: newest version published, 0 for none yet.
         paused: whether it was told to pause.

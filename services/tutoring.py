@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from actors.tasks.registry import make_task
+from actors.tasks.task import Situation, Task
 from proto.config import Config, load_config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
@@ -17,12 +18,52 @@ from proto.recording import read_episode
 from services.playing import Job, play_all
 
 
-def parse_cases(text: str, count: int) -> list[int]:
-    """Read `all`, or numbers and ranges such as `0,3,7-9`, of cases 0 .. count - 1.
+@dataclass(frozen=True)
+class Case:
+    """A situation to be tutored.
+
+    Attributes:
+        name: what its files are called, the same whenever it is recorded.
+        number: index of a tutored case of the task, or the seed of a random one.
+        situation: what it is.
+    """
+
+    name: str
+    number: int
+    situation: Situation
+
+    @classmethod
+    def tutored(cls, task: Task, index: int) -> Self:
+        """One of the task's tutored cases."""
+        return cls(f"case{index:02d}", index, task.tutored()[index])
+
+    @classmethod
+    def random(cls, task: Task, seed: int) -> Self:
+        """The situation that the task samples with a seed."""
+        return cls(f"random{seed:06d}", seed, task.sample(seed))
+
+
+def parse_cases(text: str, task: Task, seed: int) -> list[Case]:
+    """Read which cases of a task are asked for.
+
+    Args:
+        text: `all`, numbers and ranges such as `0,3,7-9`, or `random:40`.
+        task: the task.
+        seed: random case i is what the task samples with seed + i, so that more of them are the
+            same ones and others.
 
     Raises:
-        UserError: it is neither, or there is no such case.
+        UserError: it is none of these, or there is no such case.
     """
+    kind, colon, count = text.partition(":")
+    if kind != "random":
+        return [Case.tutored(task, index) for index in _indices(text, len(task.tutored()))]
+    if not colon or not count.isdecimal() or int(count) < 1:
+        raise UserError(f"--cases {text}: write how many, such as random:40")
+    return [Case.random(task, seed + i) for i in range(int(count))]
+
+
+def _indices(text: str, count: int) -> list[int]:
     if text == "all":
         return list(range(count))
     cases: set[int] = set()
@@ -31,22 +72,23 @@ def parse_cases(text: str, count: int) -> list[int]:
         try:
             cases.update(range(int(first), int(last if dash else first) + 1))
         except ValueError:
-            raise UserError(f"--cases {text}: write all, or numbers such as 0,3,7-9") from None
+            raise UserError(
+                f"--cases {text}: write all, random:40, or numbers such as 0,3,7-9"
+            ) from None
     if not cases or max(cases) >= count:
         raise UserError(f"--cases {text}: the cases are 0 to {count - 1}")
     return sorted(cases)
 
 
-def tutoring_jobs(config: Config, cases: Sequence[int], folder: Path) -> list[Job]:
+def tutoring_jobs(config: Config, cases: Sequence[Case], folder: Path) -> list[Job]:
     """The episodes of a folder: every case `config.tutor.repeats` times, the first time clean."""
-    situations = make_task(config.task).tutored()
     return [
         Job(
-            situation=situations[case],
-            seed=TutoringCase(case, repeat).seed,
+            situation=case.situation,
+            seed=TutoringCase(config.task.name, case.number, repeat).seed,
             kind=Kind.TUTORING,
             noisy=repeat > 0,
-            record_to=folder / f"case{case:02d}_repeat{repeat:02d}.mcap",
+            record_to=folder / f"{case.name}_repeat{repeat:02d}.mcap",
         )
         for repeat in range(config.tutor.repeats)
         for case in cases

@@ -6,9 +6,9 @@ Task frame of the paper: X lateral (negative is the robot's right), Y forward, Z
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +27,12 @@ Array = NDArray[np.float64]
 OBSTACLE_X_M: Final = (-0.22, -0.27, -0.32)
 OBJECT_Y_M: Final = (0.20, 0.25, 0.30)
 OBJECT_YAW_DEG: Final = (-45.0, -22.5, 0.0, 22.5, 45.0)
-NAMES: Final = ("obstacle_x_m", "object_y_m", "object_yaw_deg")
-RANGES: Final[Mapping[str, tuple[float, float]]] = {
-    "obstacle_x_m": (min(OBSTACLE_X_M), max(OBSTACLE_X_M)),
-    "object_y_m": (min(OBJECT_Y_M), max(OBJECT_Y_M)),
-    "object_yaw_deg": (min(OBJECT_YAW_DEG), max(OBJECT_YAW_DEG)),
+GRID: Final[Mapping[str, tuple[float, ...]]] = {
+    "obstacle_x_m": OBSTACLE_X_M,
+    "object_y_m": OBJECT_Y_M,
+    "object_yaw_deg": OBJECT_YAW_DEG,
 }
+"""What is tutored of each value of a situation; the tested ranges are what these span."""
 
 # Sizes are the paper's. The object's X, the obstacle's Y and the height of the table it leaves
 # open; here they are where the arm reaches every corner of the ranges.
@@ -86,60 +86,49 @@ def obstacle_pose(situation: Situation) -> Pose:
 
 
 class Experiment1:
-    """The task; see the module's docstring."""
+    """The task; see the module's docstring.
+
+    Attributes:
+        grid: the tutored values of what makes a situation, by name.
+    """
 
     name = "experiment1"
+    grid: ClassVar[Mapping[str, tuple[float, ...]]] = GRID
     phases = np.repeat(np.arange(1, 9, dtype=np.uint8), list(SUBTASKS.values()))
     start = START
 
     def tutored(self) -> tuple[Situation, ...]:
-        """The paper's 45 cases."""
-        grid = itertools.product(OBSTACLE_X_M, OBJECT_Y_M, OBJECT_YAW_DEG)
-        return tuple(dict(zip(NAMES, values, strict=True)) for values in grid)
+        """The cases of the grid; the paper's 45."""
+        return self._situations(itertools.product(*self.grid.values()))
 
     def sample(self, seed: int) -> Situation:
         """An unlearned situation, uniform inside the ranges; the same seed gives the same."""
         random = np.random.default_rng(seed)
-        return {name: float(random.uniform(*RANGES[name])) for name in NAMES}
+        return {name: float(random.uniform(*limits)) for name, limits in self.ranges().items()}
 
     def corners(self) -> tuple[Situation, ...]:
-        """The eight corners of the ranges."""
-        corners = itertools.product(*(RANGES[name] for name in NAMES))
-        return tuple(dict(zip(NAMES, values, strict=True)) for values in corners)
+        """The corners of the ranges."""
+        return self._situations(itertools.product(*self.ranges().values()))
 
     def check(self, situation: Situation) -> None:
         """Raise UserError unless the situation has this task's values within its ranges."""
-        if set(situation) != set(NAMES):
-            raise UserError(f"experiment1: a situation has {NAMES}, not {tuple(situation)}")
-        for name, (low, high) in RANGES.items():
+        if set(situation) != set(self.grid):
+            wanted, given = ", ".join(self.grid), ", ".join(situation)
+            raise UserError(f"{self.name}: a situation has {wanted}; this one has {given}")
+        for name, (low, high) in self.ranges().items():
             if not low - 1e-9 <= situation[name] <= high + 1e-9:
                 raise UserError(
-                    f"experiment1: {name} = {situation[name]} lies outside {low} .. {high}"
+                    f"{self.name}: {name} = {situation[name]} lies outside {low} .. {high}"
                 )
 
+    def ranges(self) -> Mapping[str, tuple[float, float]]:
+        """Smallest and largest of each value."""
+        return {name: (min(values), max(values)) for name, values in self.grid.items()}
+
     def scene(self, situation: Situation) -> Scene:
-        """Table, obstacle and object."""
-        table = Pose((*TABLE_CENTRE_M, -TABLE_SIZE_M[2] / 2))
+        """Table, obstacle if there is one, and object."""
         return Scene(
-            boxes=(
-                Box("table", TABLE_SIZE_M, table, (0.75, 0.72, 0.65), friction=FRICTION),
-                Box(
-                    "obstacle",
-                    OBSTACLE_SIZE_M,
-                    obstacle_pose(situation),
-                    (0.9, 0.8, 0.1),
-                    friction=FRICTION,
-                    watched=True,
-                ),
-                Box(
-                    "object",
-                    OBJECT_SIZE_M,
-                    object_pose(situation),
-                    (0.8, 0.1, 0.1),
-                    mass_kg=OBJECT_MASS_KG,
-                    friction=FRICTION,
-                ),
-            ),
+            boxes=(_table(), *_obstacles(situation), _object(situation)),
             start=targets_of_action(START),
             table_drop_m=TABLE_DROP_M,
         )
@@ -147,6 +136,32 @@ class Experiment1:
     def judge(self, situation: Situation) -> Experiment1Judge:
         """A judge for one episode of the situation."""
         return Experiment1Judge(situation)
+
+    def _situations(self, rows: Iterable[tuple[float, ...]]) -> tuple[Situation, ...]:
+        return tuple(dict(zip(self.grid, row, strict=True)) for row in rows)
+
+
+def _table() -> Box:
+    place = Pose((*TABLE_CENTRE_M, -TABLE_SIZE_M[2] / 2))
+    return Box("table", TABLE_SIZE_M, place, (0.75, 0.72, 0.65), friction=FRICTION)
+
+
+def _obstacles(situation: Situation) -> tuple[Box, ...]:
+    if "obstacle_x_m" not in situation:
+        return ()
+    place, colour = obstacle_pose(situation), (0.9, 0.8, 0.1)
+    return (Box("obstacle", OBSTACLE_SIZE_M, place, colour, friction=FRICTION, watched=True),)
+
+
+def _object(situation: Situation) -> Box:
+    return Box(
+        "object",
+        OBJECT_SIZE_M,
+        object_pose(situation),
+        (0.8, 0.1, 0.1),
+        mass_kg=OBJECT_MASS_KG,
+        friction=FRICTION,
+    )
 
 
 @dataclass(frozen=True)

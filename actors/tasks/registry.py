@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from actors.tasks.experiment1 import Experiment1
+from actors.tasks.reaching import Reaching
 from actors.tasks.task import Task
 from proto.config import TaskConfig
 
-TASKS = {Experiment1.name: Experiment1}
+TASKS = {task.name: task for task in (Experiment1, Reaching)}
 
 
 def make_task(config: TaskConfig) -> Task:

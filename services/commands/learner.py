@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from actors.tasks.registry import make_task
+from actors.tasks.registry import TASKS
 from learner.process import LearnerProcess
 from proto.bus import open_bus
 from proto.keys import Role
@@ -23,7 +23,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = config_of(arguments)
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
-    cases = len(make_task(config.task).tutored())
+    cases = {name: len(task().tutored()) for name, task in TASKS.items()}
     process = arguments.id or "learner"
     with (
         only_one(config.run_folder, Role.LEARNER, "learner"),

@@ -20,7 +20,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
     add_config(parser)
     add_playing(parser)
-    parser.add_argument("--cases", default="all", help="all, or numbers such as 0,3,7-9")
+    parser.add_argument(
+        "--cases",
+        default="all",
+        help="of the tutored cases all, or numbers such as 0,3,7-9; or random:40, situations"
+        " drawn inside the ranges",
+    )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=100_000,
+        help="of random cases, one after the other; trials of a policy have seeds of their own",
+    )
     parser.add_argument(
         "--repeats",
         type=positive,
@@ -34,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Record what the folder lacks, and show how well the tutor did."""
     repeats = [] if arguments.repeats is None else [f"tutor.repeats={arguments.repeats}"]
     config = playing_config(arguments, repeats)
-    cases = parse_cases(arguments.cases, len(make_task(config.task).tutored()))
+    cases = parse_cases(arguments.cases, make_task(config.task), arguments.seed)
     jobs = tutoring_jobs(config, cases, arguments.out)
     episodes = record(config, jobs, arguments.out, workers=arguments.workers)
     tally = Tally()

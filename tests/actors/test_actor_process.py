@@ -142,20 +142,29 @@ def theatre(tmp_path: Path) -> Iterator[Theatre]:
 def test_it_shows_cases_plays_trials_and_practises(
     theatre: Theatre, policy: Callable[..., PolicyVersion]
 ) -> None:
-    theatre.cases += [TutoringCase(3, 0), TutoringCase(99, 0), TutoringCase(3, 1)]
+    theatre.cases += [
+        TutoringCase("experiment1", 3, 0),
+        TutoringCase("experiment1", 99, 0),
+        TutoringCase("experiment9", 3, 0),
+        TutoringCase("experiment1", 3, 1),
+        TutoringCase("reaching", 14, 0),
+    ]
     theatre.start_actor()
-    eventually(lambda: len(theatre.sequences) == 2, "two demonstrations")
-    clean, noisy = theatre.sequences
+    eventually(lambda: len(theatre.sequences) == 3, "three demonstrations")
+    clean, noisy, reaching = theatre.sequences
+    assert (reaching.task, reaching.seed) == ("reaching", 14000)
+    assert dict(reaching.situation) == {"object_y_m": 0.30, "object_yaw_deg": 45.0}
+    assert "obstacle" not in reaching.body_names
     assert (clean.seed, noisy.seed) == (3000, 3001)
     assert dict(clean.situation) == dict(noisy.situation) == dict(TASK.tutored()[3])
     assert {clean.kind, noisy.kind} == {Kind.TUTORING}
     assert np.array_equal(clean.actions, clean.targets)
     assert not np.array_equal(noisy.actions, noisy.targets)
     assert np.array_equal(noisy.targets, clean.targets)
-    told = theatre.tells(lambda told: told.episodes == 2 and told.outbox == 0)
+    told = theatre.tells(lambda told: told.episodes == 3 and told.outbox == 0)
     assert told.policy_version == 0
     assert told.last_kind is Kind.TUTORING
-    assert told.last_outcome is noisy.outcome.reason
+    assert told.last_outcome is reaching.outcome.reason
 
     theatre.trials.append(Trial(seed=1234))
     theatre.publish(policy(1))
@@ -169,10 +178,10 @@ def test_it_shows_cases_plays_trials_and_practises(
 
     assert theatre.command(Command.PAUSE) == ["paused"]
     paused = theatre.tells(lambda told: told.paused and told.steps_per_s == 0)
-    theatre.cases.append(TutoringCase(0, 0))
+    theatre.cases.append(TutoringCase("experiment1", 0, 0))
     assert theatre.tells(lambda t: t.time_s > paused.time_s + 1).episodes == paused.episodes
     assert theatre.command(Command.RESUME) == ["resumed"]
-    eventually(lambda: len(theatre.sequences) == 3, "it plays again")
+    eventually(lambda: len(theatre.sequences) == 4, "it plays again")
     assert stop(theatre.actor) == 0
 
 
@@ -206,7 +215,7 @@ def test_a_policy_changes_between_episodes_only(
 
 def test_a_killed_actor_sends_again_what_had_no_receipt(theatre: Theatre) -> None:
     theatre.gives_receipts = False
-    theatre.cases.append(TutoringCase(5, 0))
+    theatre.cases.append(TutoringCase("experiment1", 5, 0))
     theatre.start_actor()
     eventually(lambda: len(theatre.sequences) == 1, "a demonstration")
     theatre.actor.kill()

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from actors.simulator import ROBOT, Pose, StepReport
-from actors.tasks.experiment1 import NAMES, RANGES, SUBTASKS, Experiment1, object_pose
+from actors.tasks.experiment1 import GRID, SUBTASKS, Experiment1, object_pose
 from proto.episode import Reason
 from proto.errors import UserError
 from sim_assets.hand import CLOSED_DEG, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
@@ -40,13 +40,13 @@ def test_samples_lie_inside_the_ranges_and_repeat_with_their_seed(seed):
     situation = task.sample(seed)
     task.check(situation)
     assert situation == task.sample(seed)
-    assert tuple(situation) == NAMES
+    assert tuple(situation) == tuple(GRID)
 
 
 def test_samples_fill_the_ranges():
     task = Experiment1()
     values = np.array([list(task.sample(seed).values()) for seed in range(400)])
-    for column, (low, high) in zip(values.T, RANGES.values(), strict=True):
+    for column, (low, high) in zip(values.T, task.ranges().values(), strict=True):
         counts = np.histogram(column, bins=4, range=(low, high))[0]
         assert counts.min() > 60
 

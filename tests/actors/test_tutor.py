@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from actors.tasks.experiment1 import (
     OBSTACLE_SIZE_M,
-    RANGES,
     START,
     TABLE_DROP_M,
     Experiment1,
@@ -23,7 +22,9 @@ from actors.tutor.postures import load_key_postures
 from proto.action import ACTION_VALUES, ARM, FOCUS, GRASP, NECK
 from sim_assets.hand import OPEN_DEG
 
-situations = st.fixed_dictionaries({name: st.floats(*limits) for name, limits in RANGES.items()})
+situations = st.fixed_dictionaries(
+    {name: st.floats(*limits) for name, limits in Experiment1().ranges().items()}
+)
 ARM_OPEN = Arm(OPEN_DEG, TABLE_DROP_M)
 
 

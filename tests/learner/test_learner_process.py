@@ -13,7 +13,7 @@ from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 
 from actors.tasks.registry import make_task
-from learner.checkpoint import load_checkpoint, training_file
+from learner.checkpoint import load_checkpoint, pretraining_file, training_file
 from learner.policy import NetworkPolicy
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig, TaskConfig
@@ -33,18 +33,22 @@ from proto.metrics import LearnerMetrics, Stage
 from proto.recording import read_episode
 
 MakeEpisode = Callable[..., Episode]
-CASES = make_task(TaskConfig()).tutored()
 SETTINGS = {
     "run.name": "test",
     "tutor.repeats": 1,
     "learner.cases": [0, 20, 44],
     "learner.start_sequences": 45,
+    "learner.pretraining.task": "null",
     "learner.pretraining.epochs": 2,
     "learner.epochs": 400,
     "learner.publish_every_epochs": 5,
     "learner.checkpoint_every_epochs": 7,
     "done.policy_versions": 3,
 }
+
+
+def case(number: int, repeat: int, task: str = "experiment1") -> TutoringCase:
+    return TutoringCase(task, number, repeat)
 
 
 class School:
@@ -92,11 +96,16 @@ class School:
         eventually(given, "a case to show")
         return cases[0]
 
-    def episode(self, case: TutoringCase, **fields: object) -> Episode:
-        given = {"id": f"case{case.case}", "seed": case.seed, **fields}
-        return self._make_episode(
-            20, kind=Kind.TUTORING, actor="actor", situation=dict(CASES[case.case]), **given
-        )
+    def episode(self, shown: TutoringCase, **fields: object) -> Episode:
+        task = make_task(TaskConfig.model_validate({"name": shown.task}))
+        given = {
+            "id": f"case{shown.case}",
+            "task": shown.task,
+            "seed": shown.seed,
+            "situation": dict(task.tutored()[shown.case]),
+            **fields,
+        }
+        return self._make_episode(20, kind=Kind.TUTORING, actor="actor", **given)
 
     def send(self, episode: Episode) -> None:
         """Send a sequence until its receipt comes."""
@@ -109,8 +118,8 @@ class School:
         eventually(received, "a receipt")
 
     def show_all(self) -> None:
-        for case in SETTINGS["learner.cases"]:  # type: ignore[attr-defined]
-            self.send(self.episode(TutoringCase(case, 0)))
+        for number in SETTINGS["learner.cases"]:  # type: ignore[attr-defined]
+            self.send(self.episode(case(number, 0)))
 
     def tells(self, what: Callable[[LearnerMetrics], bool]) -> LearnerMetrics:
         eventually(lambda: self.told is not None and what(self.told), "the metrics it should tell")
@@ -130,14 +139,14 @@ def school(tmp_path: Path, make_episode: MakeEpisode) -> Iterator[School]:
 def test_it_asks_for_each_case_once_and_keeps_what_it_is_shown(school: School) -> None:
     school.start()
     given = [school.ask_until_given(), *school.ask(), *school.ask(), *school.ask()]
-    assert given == [TutoringCase(case, 0) for case in (0, 20, 44)]
+    assert given == [case(number, 0) for number in (0, 20, 44)]
     told = school.tells(lambda told: told.stage is Stage.WAITING)
     assert (told.sequences, told.loss, told.policy_version) == (0, None, 0)
 
     school.send(school.episode(given[0]))
     school.send(school.episode(given[0]))
     school.send(school.episode(given[0], id="the-same-case-shown-by-another"))
-    school.send(school.episode(TutoringCase(7, 0), id="a-case-nobody-asked-for"))
+    school.send(school.episode(case(7, 0), id="a-case-nobody-asked-for"))
     school.send(school.episode(given[1], task="experiment9", id="another-task"))
     school.tells(lambda told: told.sequences == 1)
     kept = list((school.folder / "tutoring").iterdir())
@@ -149,8 +158,46 @@ def test_it_asks_for_each_case_once_and_keeps_what_it_is_shown(school: School) -
     school.process.kill()
     school.process.wait()
     school.start()
-    assert school.ask_until_given() == TutoringCase(20, 0)
+    assert school.ask_until_given() == case(20, 0)
     assert stop(school.process) == 0
+
+
+def test_pretraining_has_cases_of_its_own_and_does_not_wait_for_the_others(
+    school: School,
+) -> None:
+    asked = {"task": "reaching", "cases": "[0,14]", "repeats": 1, "epochs": 3}
+    words = [f"--set=learner.pretraining.{name}={value}" for name, value in asked.items()]
+    school.start(*words, "--set", "learner.publish_every_epochs=400")
+    first, second = case(0, 0, "reaching"), case(14, 0, "reaching")
+    assert [school.ask_until_given(), *school.ask(), *school.ask()] == [first, second, case(0, 0)]
+    school.send(school.episode(case(0, 0)))
+    school.send(school.episode(first, id="reaching0"))
+    assert school.tells(lambda told: told.sequences == 2).stage is Stage.WAITING
+
+    school.send(school.episode(second, id="reaching14"))
+    formed = pretraining_file(school.folder)
+    eventually(formed.exists, "pre-training is over")
+    told = school.tells(lambda told: told.stage is Stage.WAITING and told.epoch == 3)
+    assert (told.epochs_total, told.sequences) == (3, 3)
+    checkpoint = load_checkpoint(formed)
+    assert checkpoint.metadata.stage is Stage.PRETRAINING
+    training = checkpoint.metadata.training
+    assert training is not None
+    assert training.sequences == ("reaching0", "reaching14")
+    assert set(training.classes) == {"object_y_m", "object_yaw_deg"}
+    assert checkpoint.part("classifier.")["weight"].shape == (3 + 5, 20)
+
+    # it goes on with the others once they are there, also after a restart
+    school.process.kill()
+    school.process.wait()
+    school.start(*words, "--set", "learner.publish_every_epochs=400")
+    school.show_all()
+    school.tells(lambda told: told.stage is Stage.COUPLED and told.epoch > 0)
+    assert stop(school.process) == 0
+    kept = {path.stem for path in (school.folder / "pretraining").iterdir()}
+    assert kept == {"reaching0", "reaching14"}
+    tutored = {path.stem for path in (school.folder / "tutoring").iterdir()}
+    assert tutored == {"case0", "case20", "case44"}
 
 
 def test_a_killed_learner_publishes_its_policy_again_and_goes_on(school: School) -> None:

@@ -49,7 +49,7 @@ WORDS = st.text(st.characters(categories=("L", "N", "P", "Zs")), max_size=40).fi
 COUNTS = st.integers(0, 2**31)
 MESSAGES = st.one_of(
     st.builds(Receipt, IDS),
-    st.builds(TutoringCase, COUNTS, COUNTS),
+    st.builds(TutoringCase, WORDS, COUNTS, COUNTS),
     st.builds(TrialRequest, IDS, IDS, COUNTS),
     st.builds(Trial, st.integers(0, 2**63 - 1)),
     st.builds(Control, st.sampled_from(Command)),

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from actors.tasks.experiment1 import Experiment1
+from actors.tasks.reaching import Reaching
 from proto.episode import Kind
 from proto.errors import UserError
 from proto.recording import read_episode
@@ -79,13 +80,42 @@ def test_another_tutor_is_not_mixed_in(
     [("all", list(range(45))), ("0,3,7", [0, 3, 7]), ("0-3", [0, 1, 2, 3]), ("7,0-1,1", [0, 1, 7])],
 )
 def test_cases_can_be_listed(text: str, cases: list[int]) -> None:
-    assert parse_cases(text, 45) == cases
+    task = Experiment1()
+    listed = parse_cases(text, task, seed=0)
+    assert [case.number for case in listed] == cases
+    assert [case.situation for case in listed] == [task.tutored()[case] for case in cases]
 
 
-@pytest.mark.parametrize("text", ["", "some", "45", "1,99", "-1", "3-", "5-2"])
+def test_more_random_cases_are_the_same_and_others() -> None:
+    few, more = (parse_cases(f"random:{count}", Reaching(), seed=500) for count in (2, 4))
+    assert more[:2] == few
+    assert [case.name for case in more] == [f"random00050{i}" for i in range(4)]
+    assert [case.situation for case in more] == [Reaching().sample(500 + i) for i in range(4)]
+
+
+def test_random_cases_are_recorded_where_others_were(tmp_path: Path) -> None:
+    command = f"tutor --task reaching --seed 7 --repeats 2 --workers 1 --out {tmp_path}".split()
+    assert main([*command, "--cases", "14"]) == 0
+    assert main([*command, "--cases", "random:1"]) == 0
+    recorded = sorted(tmp_path.glob("*.mcap"))
+    assert [path.name for path in recorded] == [
+        f"{case}_repeat{repeat:02d}.mcap"
+        for case in ("case14", "random000007")
+        for repeat in (0, 1)
+    ]
+    *_, clean, noisy = map(read_episode, recorded)
+    assert clean.task == "reaching"
+    assert clean.situation == noisy.situation == Reaching().sample(7)
+    assert not np.array_equal(clean.actions, noisy.actions)
+    assert "obstacle" not in clean.body_names
+
+
+@pytest.mark.parametrize(
+    "text", ["", "some", "45", "1,99", "-1", "3-", "5-2", "random", "random:0", "random:x"]
+)
 def test_cases_that_are_not_there_are_refused(text: str) -> None:
     with pytest.raises(UserError, match="--cases"):
-        parse_cases(text, 45)
+        parse_cases(text, Experiment1(), seed=0)
 
 
 def test_ctrl_c_stops_cleanly(tmp_path: Path) -> None:

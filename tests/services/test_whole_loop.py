@@ -21,6 +21,7 @@ from proto.recording import read_episode
 VERSIONS = 4
 TRIALS = 4
 CASES = (0, 11, 22, 44)
+PRETRAINING_CASES = (0, 14)
 SETTINGS = {
     "run.name": "loop",
     "simulator.render": "false",
@@ -28,6 +29,8 @@ SETTINGS = {
     "tutor.repeats": 2,
     "learner.cases": list(CASES),
     "learner.start_sequences": 4,
+    "learner.pretraining.cases": list(PRETRAINING_CASES),
+    "learner.pretraining.repeats": 2,
     "learner.pretraining.epochs": 2,
     "learner.epochs": 30 * VERSIONS,
     "learner.publish_every_epochs": 30,
@@ -112,9 +115,14 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
         assert loop.stop_all() == [0] * 6
 
     assert isinstance(evaluated, EvaluatorMetrics)
-    sequences = [read_episode(path) for path in (loop.folder / "tutoring").glob("*.mcap")]
-    planned = [case * 1000 + repeat for case in CASES for repeat in (0, 1)]
-    assert sorted(episode.seed for episode in sequences) == sorted(planned)
+    for folder, task, cases in (
+        ("tutoring", "experiment1", CASES),
+        ("pretraining", "reaching", PRETRAINING_CASES),
+    ):
+        sequences = [read_episode(path) for path in (loop.folder / folder).glob("*.mcap")]
+        assert {episode.task for episode in sequences} == {task}
+        planned = [case * 1000 + repeat for case in cases for repeat in (0, 1)]
+        assert sorted(episode.seed for episode in sequences) == sorted(planned)
 
     versions = [policy.version for policy in policies]
     assert versions == sorted(versions)
