@@ -58,7 +58,8 @@ class Outcome:
         lifted_m: height of the object above its start at the end (m).
         moved_mm: how far the object was moved before the hand closed.
         turned_deg: how far the object was turned before the hand closed.
-        yaw_error_deg: yaw of the hand's grasp axis against the object's when it closed.
+        yaw_error_deg: yaw of the hand's grasp axis less the object's when the hand closed, in the
+            task frame, -90..90.
         along_mm: offset of the grasp centre along the object's long axis when the hand closed.
         across_mm: offset across it.
         closed_at: control step at which the hand closed, or -1.

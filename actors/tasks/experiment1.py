@@ -217,7 +217,7 @@ class Experiment1Judge:
         unmoved = before.moved_mm <= MOVED_MM and before.turned_deg <= TURNED_DEG
         strict = held and unmoved and closed_at >= 0 and touched_at < 0
         right = (
-            before.yaw_error_deg <= YAW_ERROR_DEG
+            abs(before.yaw_error_deg) <= YAW_ERROR_DEG
             and abs(before.along_mm) <= ALONG_MM
             and abs(before.across_mm) <= ACROSS_MM
         )
@@ -250,12 +250,13 @@ class Experiment1Judge:
         moved = np.subtract(instant.body.position_m, self._start.position_m)
         yaw = _yaw_deg(instant.body)
         axis, grasp_centre = _grasp(instant.hand)
+        hand_yaw = float(np.rad2deg(np.arctan2(axis[1], axis[0])))
         centre = grasp_centre - instant.body.position_m
         turn = np.deg2rad(yaw)
         return _Approach(
             moved_mm=1e3 * float(np.hypot(moved[0], moved[1])),
             turned_deg=float(abs(_half_turn(yaw - _yaw_deg(self._start)))),
-            yaw_error_deg=float(abs(_half_turn(np.rad2deg(np.arctan2(axis[1], axis[0])) - yaw))),
+            yaw_error_deg=_half_turn(yaw - hand_yaw),  # the task frame's yaw turns the other way
             along_mm=1e3 * float(-centre[0] * np.sin(turn) + centre[1] * np.cos(turn)),
             across_mm=1e3 * float(centre[0] * np.cos(turn) + centre[1] * np.sin(turn)),
         )

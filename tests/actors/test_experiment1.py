@@ -102,7 +102,14 @@ def test_a_right_grasp_is_precise():
     assert outcome.lifted_m == pytest.approx(0.1)
     assert abs(outcome.along_mm) < 1e-6
     assert abs(outcome.across_mm) < 1e-6
-    assert outcome.yaw_error_deg < 1e-6
+    assert abs(outcome.yaw_error_deg) < 1e-6
+
+
+@pytest.mark.parametrize("turned_too_far_deg", [-30.0, -8.0, 8.0, 30.0])
+def test_the_yaw_error_has_the_sign_of_the_task_frame(turned_too_far_deg):
+    """A hand at a yaw that the task calls larger than the object's errs by a positive angle."""
+    flaw = bodies(hand_yaw=-turned_too_far_deg)  # the task frame is left-handed
+    assert judged(flaw).yaw_error_deg == pytest.approx(turned_too_far_deg)
 
 
 @pytest.mark.parametrize(
