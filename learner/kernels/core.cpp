@@ -800,8 +800,15 @@ void Pass<Real>::inputs(const Group& group, int chunk, const Scratch& scratch) c
   for (int lane = 0; lane < group.members; ++lane) {
     const Real* deltas = scratch.rows + std::ptrdiff_t(lane) * kChunk * pitch;
     const Real* seen = problem_.seen + (group.row[lane] + begin - lag_) * units;
+    const int later = std::min(lane + 1, kLanes - 1);
+    const Real* soon = problem_.seen + (group.row[later] + begin - lag_) * units;
     int f = 0;
     for (; f + kWide * kLanes <= units; f += kWide * kLanes) {
+      for (int t = 0; t < count; ++t) {
+        for (int v = 0; v < kWide; ++v) {
+          __builtin_prefetch(soon + std::ptrdiff_t(t) * units + f + v * kLanes, 0, 2);
+        }
+      }
       for (int i = 0; i < pfc.padded; i += kSide) {
         add_rank_products<Real, kWide>(deltas + i, pitch, seen + f, units, count,
                                        sums + std::ptrdiff_t(i) * units + f);
