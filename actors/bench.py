@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from statistics import median
-from typing import Final
+from typing import Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,9 @@ from actors.tasks.task import Situation, Task
 from actors.tutor.plan import plan
 from learner.checkpoint import NETWORK_PREFIX, Checkpoint, CheckpointMetadata, CodeRanges
 from learner.policy import NetworkPolicy
+from learner.stepping import Parameters, SteppingNetwork, make_acting_network
 from learner.subnets import parameter_shapes
+from learner.vision_input import vision_input
 from proto.action import ACTION_VALUES, FOCUS
 from proto.codec import encode
 from proto.config import Config, NetworkConfig
@@ -91,7 +93,7 @@ def bench_actor(config: Config) -> ActorSpeed:
         closing(make_simulator(config.simulator)) as second,
     ):
         _play(simulator, task, tutor, situation)  # warms up
-        shadow = _Shadow(second, task)
+        shadow = _Shadow(second, task, others)
         end = time.perf_counter() + LIMIT_S
         while len(tutored) < ROUNDS and (not tutored or time.perf_counter() < end):
             shadow.begin(situation)
@@ -203,11 +205,12 @@ def random_checkpoint(config: NetworkConfig) -> Checkpoint:
 class _Shadow:
     """Does in a simulator of its own what another is told, step by step, and measures both."""
 
-    def __init__(self, simulator: Simulator, task: Task) -> None:
+    def __init__(self, simulator: Simulator, task: Task, networks: _OtherNetworks) -> None:
         self.whole_loop, self.render, self.physics = _Laps(), _Laps(), _Laps()
         self.whole_work, self.bare_work = _Laps(time.process_time), _Laps(time.process_time)
         self._simulator = simulator
         self._task = task
+        self._networks = networks
 
     def begin(self, situation: Situation) -> None:
         """Start an episode."""
@@ -215,7 +218,7 @@ class _Shadow:
         self._focus = float(self._task.start[FOCUS])
         self._first = True
 
-    def follow(self, action: NDArray[np.float64]) -> None:
+    def follow(self, live: LiveStep) -> None:
         """Observe and run one control step; between two calls the other loop goes round once."""
         if not self._first:
             self.whole_loop.stop()
@@ -224,8 +227,9 @@ class _Shadow:
             with self.render:
                 self._simulator.observe(crop_of_focus(self._focus))
             with self.physics:
-                self._simulator.step(targets_of_action(action))
-        self._focus = float(action[FOCUS])
+                self._simulator.step(targets_of_action(live.action))
+        self._networks.step(live.image)
+        self._focus = float(live.action[FOCUS])
         self._first = False
         self.whole_loop.start()
         self.whole_work.start()
@@ -242,9 +246,9 @@ def _play(
     assignment = Assignment(Kind.TRIAL, task, policy, situation, seed=0)
 
     def on_step(live: LiveStep) -> None:
-        encode(live_message("bench", assignment, live))
+        encode(live_message("bench", assignment, live), check=False)
         if shadow is not None:
-            shadow.follow(live.action)
+            shadow.follow(live)
 
     episode = play(
         simulator, task, policy, situation, seed=0, kind=assignment.kind, on_step=on_step

@@ -213,7 +213,8 @@ class ActorProcess:
                 raise _StoppedError
             self._pace.add()
             if self._config.actor.live and self._bus.watched(live_key):
-                self._bus.publish(live_key, live_message(self._bus.id, assignment, live))
+                message = live_message(self._bus.id, assignment, live)
+                self._bus.publish(live_key, message, check=False)
 
         return play(
             self._simulator,

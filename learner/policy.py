@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Self, cast
 
@@ -15,8 +15,9 @@ from learner.checkpoint import (
     checkpoint_from_bytes,
     load_checkpoint,
 )
-from learner.stepping import Parameters, SteppingNetwork, make_acting_network
+from learner.stepping import ActingNetwork, Parameters, SteppingNetwork, make_acting_network
 from learner.vision_input import vision_input
+from proto.config import NetworkConfig
 from proto.episode import Floats, Image
 from proto.errors import UserError
 
@@ -35,7 +36,12 @@ class NetworkPolicy:
     looks = True
     target: NDArray[np.float64] | None = None
 
-    def __init__(self, checkpoint: Checkpoint, origin: str) -> None:
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        origin: str,
+        make_network: Callable[[NetworkConfig, Parameters], ActingNetwork] = make_acting_network,
+    ) -> None:
         """Make a policy of a checkpoint; `origin` is where it came from, for messages.
 
         Raises:
@@ -54,7 +60,7 @@ class NetworkPolicy:
         self.version = metadata.version
         self.outputs: NDArray[np.float32] | None = np.zeros(code.references.size, np.float32)
         self._code = code
-        self._network = make_acting_network(metadata.network, parameters)
+        self._network = make_network(metadata.network, parameters)
         self._sizes, self._parameters = metadata.network, parameters
         self._image_shape = (height, width)
 

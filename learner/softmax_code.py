@@ -70,5 +70,5 @@ class SoftmaxCode:
 
     def decode(self, outputs: NDArray[np.floating]) -> Values:
         """Actions (..., 11) for outputs (..., 11, softmax units), within what the robot accepts."""
-        means = np.einsum("...vu,vu->...v", outputs, self.references)
-        return np.asarray(np.minimum(np.maximum(means, _LOWEST), _HIGHEST))
+        means = np.vecdot(outputs, self.references)
+        return np.asarray(means.clip(_LOWEST, _HIGHEST))

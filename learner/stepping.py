@@ -33,6 +33,12 @@ class ActingNetwork(Protocol):
     def step(self, image: Array) -> Array:
         """Outputs (11, softmax units) for the image (height, width) seen now, -1..1."""
 
+    def see(self, image: Array) -> Array:
+        """The first half of a step: activity (units,) of V_S."""
+
+    def act(self, seen: Array) -> Array:
+        """The second half: outputs for what `see` returned."""
+
 
 def make_acting_network(config: NetworkConfig, parameters: Parameters) -> ActingNetwork:
     """The network compiled, in float32, or in numpy where nothing can be compiled.
@@ -85,8 +91,16 @@ class SteppingNetwork:
 
     def step(self, image: Array) -> Array:
         """Outputs (11, softmax units) for the image (height, width) seen now, -1..1."""
+        return self.act(self.see(image))
+
+    def see(self, image: Array) -> Array:
+        """Activity (units,) of V_S, the maps of one place side by side."""
+        return self._mstnn_slow.step(self._mstnn_fast.step(image)).ravel()
+
+    def act(self, seen: Array) -> Array:
+        """Outputs (11, softmax units) for what `see` returned."""
         before = self._activity
-        now = [self._mstnn_slow.step(self._mstnn_fast.step(image)).ravel()]
+        now = [seen]
         source = now if self._bottom_up else before
         for number, level in enumerate(self._levels):
             below, own, *above = source[number], *before[number + 1 : number + 3]

@@ -160,9 +160,9 @@ class Bus:
             self._watched[key] = self._session.declare_publisher(key)
         return self._watched[key].matching_status.matching
 
-    def publish(self, key: str, message: Any) -> None:
-        """Publish a message that may be lost."""
-        self._put(key, encode(message), zenoh.CongestionControl.DROP)
+    def publish(self, key: str, message: Any, *, check: bool = True) -> None:
+        """Publish a message that may be lost, also because it is wrong and was not checked."""
+        self._put(key, encode(message, check=check), zenoh.CongestionControl.DROP)
 
     def deliver(self, key: str, message: Any) -> None:
         """Publish a message, waiting while the link is full; see the top of this module."""

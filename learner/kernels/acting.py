@@ -6,10 +6,10 @@ It computes in float32 what `learner.stepping` says in numpy. See `acting.cpp` f
 from __future__ import annotations
 
 import ctypes
-import functools
 import logging
 import weakref
 from collections.abc import Mapping
+from functools import cache, partial
 from math import prod
 from typing import Final
 
@@ -76,38 +76,41 @@ class CompiledNetwork:
         if library is None:
             raise RuntimeError("there is no compiled library")
         by_name = subnets(config)
-        _, *self._image_shape = by_name["vision_input"].shape
-        self._features = prod(by_name["mstnn_slow"].shape)
-        self._output_shape = by_name["outputs"].shape
-        self._library = library
-        self._network = _make(library, config, by_name, parameters)
-        weakref.finalize(self, library.vmdnn_acting_free, self._network)
+        network = _make(library, config, by_name, parameters)
+        weakref.finalize(self, library.vmdnn_acting_free, network)
+        _, height, width = by_name["vision_input"].shape
+        self._image = np.zeros((height, width), np.float32)
+        self._seen = np.zeros(prod(by_name["mstnn_slow"].shape), np.float32)
+        self._outputs = np.zeros(by_name["outputs"].shape, np.float32)
+        image, seen, outputs = (
+            array.ctypes.data for array in (self._image, self._seen, self._outputs)
+        )
+        self._reset = partial(library.vmdnn_acting_reset, network)
+        self._see = partial(library.vmdnn_acting_see, network, image, seen)
+        self._act = partial(library.vmdnn_acting_act, network, seen, outputs)
 
     def reset(self) -> None:
         """Return to the neutral state."""
-        self._library.vmdnn_acting_reset(self._network)
+        self._reset()
 
     def step(self, image: Array) -> Array:
         """Outputs (11, softmax units) for the image (height, width) seen now, -1..1."""
-        return self.act(self.see(image))
+        np.copyto(self._image, image)
+        self._see()
+        self._act()
+        return self._outputs.copy()
 
     def see(self, image: Array) -> Array:
-        """Activity of V_S, (units,), for the image (height, width) seen now, -1..1."""
-        image = np.ascontiguousarray(image, np.float32)
-        if list(image.shape) != self._image_shape:
-            raise ValueError(f"the image is {image.shape}, but must be {self._image_shape}")
-        seen = np.empty(self._features, np.float32)
-        self._library.vmdnn_acting_see(self._network, image.ctypes.data, seen.ctypes.data)
-        return seen
+        """The first half of a step: activity (units,) of V_S."""
+        np.copyto(self._image, image)
+        self._see()
+        return self._seen.copy()
 
     def act(self, seen: Array) -> Array:
-        """Outputs (11, softmax units) for what `see` returned."""
-        seen = np.ascontiguousarray(seen, np.float32)
-        if seen.shape != (self._features,):
-            raise ValueError(f"V_S is {seen.shape}, but must be ({self._features},)")
-        outputs = np.empty(self._output_shape, np.float32)
-        self._library.vmdnn_acting_act(self._network, seen.ctypes.data, outputs.ctypes.data)
-        return outputs
+        """The second half: outputs for what `see` returned."""
+        np.copyto(self._seen, seen)
+        self._act()
+        return self._outputs.copy()
 
 
 def _make(
@@ -155,7 +158,7 @@ def _in_one_row(config: NetworkConfig, parameters: Mapping[str, Array]) -> Float
     return np.concatenate(row)
 
 
-@functools.cache
+@cache
 def _library() -> ctypes.PyDLL | None:
     """The compiled library, if there is one; says once whether.
 
@@ -166,9 +169,9 @@ def _library() -> ctypes.PyDLL | None:
         path = find_or_compile()
         library = ctypes.PyDLL(str(path))
     except (NotCompiledError, OSError) as error:
-        _log.warning("acting network: in numpy, several times slower than compiled: %s", error)
+        _log.warning("acting: in numpy, several times slower than compiled: %s", error)
         return None
-    _log.info("acting network: compiled C++ (%s)", path)
+    _log.info("acting: compiled C++ (%s)", path)
     pointer = ctypes.c_void_p
     library.vmdnn_acting_new.restype = pointer
     for name, arguments in (("free", 1), ("reset", 1), ("see", 3), ("act", 3)):

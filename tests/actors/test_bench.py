@@ -14,8 +14,9 @@ def test_prints_what_was_measured(monkeypatch, capsys):
     monkeypatch.setattr(bench, "ROUNDS", 1)
     assert main(["bench", "actor", "--json"]) == 0
     speed = json.loads(capsys.readouterr().out)
-    assert list(speed)[:7] == [
-        "machine", "backend", "physics_ms", "render_ms", "network_ms", "steps_per_s", "ratio",
+    assert list(speed) == [
+        "machine", "backend", "physics_ms", "render_ms", "network_ms", "network_numpy_ms",
+        "core_ms", "steps_per_s", "ratio", "episode_s",
     ]  # fmt: skip
     assert speed["backend"] == "sapien"
     assert "core" in speed["machine"]
