@@ -31,6 +31,7 @@ Tensors = Mapping[str, NDArray[np.generic]]
 
 _METADATA_KEY: Final = "vmdnn"
 NETWORK_PREFIX: Final = "network."
+CLASSIFIER_PREFIX: Final = "classifier."
 
 
 class _Model(BaseModel):

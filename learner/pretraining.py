@@ -89,10 +89,9 @@ class Pretraining:
     def loss(self, chosen: Tensor) -> Tensor:
         """Mean divergence of the answers to the labels, for the sequences with these indices."""
         indices = chosen.tolist()
-        images = [torch.from_numpy(vision_input(self._images[index])) for index in indices]
+        images = [self._images[index] for index in indices]
         labels = torch.from_numpy(np.stack([self._labels[index] for index in indices]))
-        seen = self._network.see(nn.utils.rnn.pad_sequence(images, batch_first=True))
-        answers = self.classifier(run_levels([self._network.pfc], seen, "bottom_up"))
+        answers = self.classifier(run_levels([self._network.pfc], self._see(images), "bottom_up"))
         asked = self._asked([len(image) for image in images])
         losses = [
             kl_divergence(
@@ -105,6 +104,11 @@ class Pretraining:
             )
         ]
         return torch.stack(losses).mean()
+
+    def _see(self, images: Sequence[Image]) -> Tensor:
+        """V_S (B, T, units) for pictures of any lengths T; filled up at the end with black."""
+        grey = nn.utils.rnn.pad_sequence([torch.from_numpy(each) for each in images], True)
+        return self._network.see(torch.from_numpy(vision_input(grey.numpy())))
 
     def _asked(self, lengths: Sequence[int]) -> Tensor:
         """(B, T) one in the last part of each sequence, where the answer is asked for."""

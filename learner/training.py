@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from learner.checkpoint import (
+    CLASSIFIER_PREFIX,
     NETWORK_PREFIX,
     Checkpoint,
     CheckpointMetadata,
@@ -44,7 +45,6 @@ from proto.episode import Episode
 from proto.errors import UserError
 from proto.metrics import Stage
 
-_CLASSIFIER_PREFIX: Final = "classifier."
 _OPTIMIZER_PREFIX: Final = "optimizer."
 _RANDOM_STATE: Final = "random.state"
 
@@ -185,7 +185,7 @@ class Trainer:
         if self._optimization is not None:
             parts |= _prefixed(_OPTIMIZER_PREFIX, self._optimization.tensors())
         if isinstance(self._lesson, Pretraining):
-            parts |= _prefixed(_CLASSIFIER_PREFIX, self._lesson.classifier.state_dict())
+            parts |= _prefixed(CLASSIFIER_PREFIX, self._lesson.classifier.state_dict())
         save_checkpoint(path, Checkpoint(self._metadata(self._training_metadata()), _arrays(parts)))
 
     def _enter(self, stage: Stage) -> None:
@@ -265,7 +265,7 @@ class Trainer:
             for episode in self._intake.again(training.sequences):
                 lesson.add(episode)
         if isinstance(lesson, Pretraining):
-            lesson.classifier.load_state_dict(_tensors(checkpoint.part(_CLASSIFIER_PREFIX)))
+            lesson.classifier.load_state_dict(_tensors(checkpoint.part(CLASSIFIER_PREFIX)))
         self._generator.set_state(_tensors(checkpoint.tensors)[_RANDOM_STATE])
         self._finish_if_done()
 

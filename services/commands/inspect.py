@@ -1,9 +1,12 @@
-"""`vmdnn inspect`: print the network's subnets, or what a checkpoint says about itself."""
+"""`vmdnn inspect`: the network's subnets, what a checkpoint says, and what its vision tells."""
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +14,14 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
+from actors.tasks.experiment1 import SUBTASKS
 from learner.checkpoint import load_checkpoint
+from learner.probing import Answer, Probe, Vision, ask_classifier, probe
+from learner.store import TutoringStore
 from learner.subnets import Subnet, subnets
+from proto.episode import Episode
 from services.commands.options import add_config, config_of
+from services.commands.training_options import filled_store
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -23,12 +31,28 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_config(network)
     checkpoint = things.add_parser("checkpoint", help="the metadata of a policy or checkpoint")
     checkpoint.add_argument("file", type=Path, metavar="FILE", help="a .safetensors file")
-    for thing in (network, checkpoint):
+    vision = things.add_parser("vision", help="what can be told of situations from V_S")
+    vision.add_argument(
+        "file",
+        type=Path,
+        metavar="FILE",
+        help="a .safetensors file; checkpoints/pretraining.safetensors of a run has the classifier",
+    )
+    vision.add_argument(
+        "--data", type=Path, required=True, help="folder of the sequences that are learned from"
+    )
+    vision.add_argument(
+        "--test", type=Path, required=True, help="folder of sequences of other situations"
+    )
+    for thing in (network, checkpoint, vision):
         thing.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the subnets or the metadata."""
+    """Print the subnets, the metadata or what the vision tells."""
+    if arguments.thing == "vision":
+        _print_vision(arguments)
+        return 0
     if arguments.thing == "network":
         network = subnets(config_of(arguments).network).values()
         rows = [_subnet_row(subnet) for subnet in network]
@@ -44,6 +68,64 @@ def run(arguments: argparse.Namespace) -> int:
         for name, value in metadata.items():
             print(f"{name:14} {value}")
     return 0
+
+
+def _print_vision(arguments: argparse.Namespace) -> None:
+    vision = Vision(load_checkpoint(arguments.file))
+    learned = _episodes(filled_store("--data", arguments.data))
+    tested = _episodes(filled_store("--test", arguments.test))
+    answers, probes = ask_classifier(vision, tested), probe(vision, learned, tested)
+    if arguments.json:
+        found = {"sequences": len(tested), "classifier": answers, "regression": probes}
+        print(json.dumps(found, indent=2, default=asdict))
+        return
+    console = Console()
+    if answers:
+        console.print(_answer_table(answers, len(tested)))
+    console.print(_probe_table(probes, len(learned), len(tested)))
+
+
+def _episodes(store: TutoringStore) -> list[Episode]:
+    return list(filter(None, map(store.load, store.ids)))
+
+
+def _answer_table(answers: Sequence[Answer], sequences: int) -> Table:
+    table = Table(box=SIMPLE, title=f"The classifier, {sequences} sequences", title_justify="left")
+    for column in ("value", "classes", "nearest class %", "mean error"):
+        table.add_column(column, justify="left" if column == "value" else "right", no_wrap=True)
+    for answer in answers:
+        right, error = f"{100 * answer.right:.1f}", _amount(answer.value, answer.error)
+        table.add_row(answer.value, str(answer.classes), right, error)
+    return table
+
+
+def _probe_table(probes: Sequence[Probe], learned: int, tested: int) -> Table:
+    """A row for each phase, a column for each value."""
+    values = list(dict.fromkeys(probe.value for probe in probes))
+    table = Table(
+        box=SIMPLE,
+        title=f"Linear regression from V_S at the end of each phase, learned from {learned}"
+        f" sequences: mean error on {tested} others",
+        title_justify="left",
+    )
+    table.add_column("phase", no_wrap=True)
+    for value in values:
+        table.add_column(value, justify="right", no_wrap=True)
+    names = dict(enumerate(SUBTASKS, 1))
+    for phase, group in groupby(probes, lambda probe: probe.phase):
+        errors = (_amount(probe.value, probe.error) for probe in group)
+        table.add_row(f"{phase} {names.get(phase, '')}", *errors)
+    blind = {probe.value: probe.blind_error for probe in probes}
+    table.add_section()
+    table.add_row("without seeing", *(_amount(value, blind[value]) for value in values))
+    return table
+
+
+def _amount(value: str, error: float) -> str:
+    """An error of a value in the unit that people use for it."""
+    if value.endswith("_m"):
+        return f"{1e3 * error:.1f} mm"
+    return f"{error:.2f} deg" if value.endswith("_deg") else f"{error:.3g}"
 
 
 def _subnet_row(subnet: Subnet) -> dict[str, Any]:

@@ -27,10 +27,10 @@ def training_stores(arguments: argparse.Namespace) -> tuple[TutoringStore, Tutor
     Raises:
         UserError: a folder is not there, or holds no sequence.
     """
-    store = _filled_store("--data", arguments.data)
+    store = filled_store("--data", arguments.data)
     if arguments.pretraining_data is None:
         return store, None
-    return store, _filled_store("--pretraining-data", arguments.pretraining_data)
+    return store, filled_store("--pretraining-data", arguments.pretraining_data)
 
 
 @contextmanager
@@ -50,7 +50,12 @@ def interruption() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _filled_store(option: str, folder: Path) -> TutoringStore:
+def filled_store(option: str, folder: Path) -> TutoringStore:
+    """The sequences in a folder that an option names.
+
+    Raises:
+        UserError: it is not there, or holds none.
+    """
     if not folder.is_dir():
         raise UserError(f"{option} {folder} is no folder; record one with `vmdnn tutor --out DIR`")
     store = TutoringStore(folder)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from actors.simulator import ROBOT, Pose, StepReport
 from actors.tasks.experiment1 import GRID, SUBTASKS, Experiment1, object_pose
+from actors.tasks.reaching import Reaching
 from proto.episode import Reason
 from proto.errors import UserError
 from sim_assets.hand import CLOSED_DEG, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
@@ -24,6 +25,19 @@ def test_the_45_tutored_cases_are_the_papers():
     assert {case["object_y_m"] for case in cases} == {0.20, 0.25, 0.30}
     assert {case["object_yaw_deg"] for case in cases} == {-45.0, -22.5, 0.0, 22.5, 45.0}
     assert len({tuple(case.values()) for case in cases}) == 45
+
+
+def test_reaching_is_the_same_without_an_obstacle():
+    cases = Reaching().tutored()
+    assert len(cases) == 15
+    assert {tuple(case) for case in cases} == {("object_y_m", "object_yaw_deg")}
+    with_obstacle = {**cases[7], "obstacle_x_m": -0.27}
+    scene, other = Reaching().scene(cases[7]), Experiment1().scene(with_obstacle)
+    assert scene.boxes == tuple(box for box in other.boxes if box.name != "obstacle")
+    np.testing.assert_equal(vars(scene.start), vars(other.start))
+    assert scene.table_drop_m == other.table_drop_m
+    with pytest.raises(UserError, match="reaching: a situation has object_y_m, object_yaw_deg"):
+        Reaching().check(with_obstacle)
 
 
 def test_an_episode_has_eight_subtasks_and_the_papers_length():

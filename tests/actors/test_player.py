@@ -9,6 +9,7 @@ from actors.player import play
 from actors.policies import make_policy, make_tutor
 from actors.simulator import make_simulator
 from actors.tasks.experiment1 import Experiment1
+from actors.tasks.reaching import Reaching
 from proto.config import Config, SimulatorConfig
 from proto.episode import Kind, Reason
 from proto.errors import UserError
@@ -62,6 +63,19 @@ def test_replay_only_works_where_it_was_recorded(physics):
 def test_lookup_is_the_tutor_on_the_grid(physics):
     case = TASK.tutored()[17]
     assert outcome(physics, "lookup", case) == outcome(physics, "tutor", case)
+
+
+@pytest.mark.parametrize("name", ["tutor", "lookup"])
+def test_without_an_obstacle_the_tutor_moves_as_over_the_middle_one(physics, name):
+    situation = {"object_y_m": 0.25, "object_yaw_deg": 22.5}
+    over = {**situation, "obstacle_x_m": -0.27}
+    free, blocked = (
+        play(physics, task, make_policy(name, Config()), where, seed=0, kind=Kind.TUTORING)
+        for task, where in ((Reaching(), situation), (TASK, over))
+    )
+    assert free.outcome.precise
+    assert free.situation == situation
+    np.testing.assert_array_equal(free.actions, blocked.actions)
 
 
 def test_lifting_needs_friction(monkeypatch):

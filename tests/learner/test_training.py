@@ -186,6 +186,15 @@ def test_pretraining_may_have_sequences_of_its_own(
     assert trainer.sequences == 4
 
 
+def test_pretraining_waits_for_sequences_of_its_own(
+    store: TutoringStore, tmp_path: Path, small_config: MakeConfig
+) -> None:
+    trainer = Trainer(small_config(pretraining=1), store, TutoringStore(tmp_path / "others"))
+    assert trainer.next_stage is Stage.PRETRAINING
+    with pytest.raises(UserError, match="others holds no tutored sequence"):
+        trainer.epoch()
+
+
 def test_sequences_of_different_lengths(
     tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:

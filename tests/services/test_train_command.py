@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from learner.checkpoint import load_checkpoint, policy_file, training_file
+from learner.checkpoint import load_checkpoint, policy_file, pretraining_file, training_file
 from learner.store import TutoringStore
 from learner.training import Trainer
 from proto.episode import Episode
@@ -67,6 +67,23 @@ def test_it_leaves_policies_a_checkpoint_and_the_config(
 
     assert train(out) == 0
     assert "is trained already" in capsys.readouterr().out
+
+
+def test_what_the_vision_tells_can_be_looked_at(
+    tmp_path: Path, data: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out) == 0
+    words = ["inspect", "vision", "--data", str(data), "--test", str(data)]
+    assert main([*words, str(pretraining_file(out))]) == 0
+    printed = capsys.readouterr().out
+    assert "The classifier, 3 sequences" in printed
+    assert "5 reach above object" in printed
+
+    assert main([*words, str(policy_file(out, 3)), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["sequences"], found["classifier"]) == (3, [])
+    assert {told["value"] for told in found["regression"]} == {"object_y"}
 
 
 @pytest.mark.parametrize("pressed_at", [1, 5])
