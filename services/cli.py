@@ -35,7 +35,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "evaluate": ("services.commands.evaluate", "test a policy on unlearned situations"),
     "replay": ("services.commands.replay", "make a video of a recorded episode"),
     "recover": ("services.commands.recover", "repair an MCAP file that was cut off"),
-    "inspect": ("services.commands.inspect", "print the network's subnets, or a checkpoint"),
+    "inspect": ("services.commands.inspect", "look into a network, a checkpoint or its vision"),
     "bench": ("services.commands.bench", "measure speed on this machine"),
     "doctor": ("services.commands.doctor", "check this machine and say what to do"),
 }
