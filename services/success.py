@@ -49,6 +49,16 @@ class Rate:
         return {"successes": self.successes, "rate": self.rate, "wilson95": list(self.wilson95)}
 
 
+def difference95(one: Rate, other: Rate) -> tuple[float, float]:
+    """Newcombe's interval at 95 % for how much higher the rate of `one` is, from Wilson's."""
+    difference = one.rate - other.rate
+    (one_low, one_high), (other_low, other_high) = one.wilson95, other.wilson95
+    return (
+        difference - math.hypot(one.rate - one_low, other_high - other.rate),
+        difference + math.hypot(one_high - one.rate, other.rate - other_low),
+    )
+
+
 @dataclass
 class Tally:
     """Outcomes counted by reading, and by why they fell short of `precise`.

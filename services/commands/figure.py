@@ -1,0 +1,62 @@
+"""`vmdnn figure`: draw a figure of the paper, or one that shows where a policy fails."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final, Protocol
+
+from rich.console import Console
+
+from services.commands.figures import activity, failures, time_constants
+from services.commands.figures.drawn import Drawn
+from services.figures.style import check_name, save
+
+
+class FigureCommand(Protocol):
+    """A module that draws one figure."""
+
+    SUMMARY: str
+
+    def configure(self, parser: argparse.ArgumentParser) -> None:
+        """Add what it takes besides --out and --json."""
+
+    def draw(self, arguments: argparse.Namespace) -> Drawn:
+        """Find out the numbers and draw them."""
+
+
+FIGURES: Final[Mapping[str, FigureCommand]] = {
+    "activity": activity,
+    "time-constants": time_constants,
+    "failures": failures,
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add a subcommand for each figure."""
+    subparsers = parser.add_subparsers(dest="figure", metavar="NAME", required=True)
+    for name, figure in FIGURES.items():
+        subparser = subparsers.add_parser(
+            name,
+            help=figure.SUMMARY,
+            description=f"{figure.SUMMARY[0].upper()}{figure.SUMMARY[1:]}.",
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+        figure.configure(subparser)
+        subparser.add_argument("--out", type=Path, required=True, help="PNG file to write")
+        subparser.add_argument("--json", action="store_true", help="print the numbers as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw the figure, and print its numbers."""
+    check_name(arguments.out)  # before hours of work
+    drawn = FIGURES[arguments.figure].draw(arguments)
+    save(drawn.figure, arguments.out)
+    if arguments.json:
+        print(json.dumps(drawn.numbers))
+    else:
+        Console().print(drawn.table)
+        print(arguments.out)
+    return 0

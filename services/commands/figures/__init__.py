@@ -1,0 +1,1 @@
+"""One module for each figure: `SUMMARY`, `configure(parser)` and `run(arguments)`."""

@@ -1,0 +1,45 @@
+"""`vmdnn figure activity`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Final
+
+from actors.policies import make_policy
+from actors.policy import StatefulPolicy
+from proto.errors import UserError
+from proto.recording import read_episode
+from services.commands.figures.drawn import Drawn
+from services.commands.options import add_config, config_of
+from services.figures import activity
+
+SUMMARY: Final = "units and outputs of the network over time (paper, figure 4)"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the figure's arguments."""
+    add_config(parser)
+    parser.add_argument(
+        "--rollouts", type=Path, nargs="+", required=True, metavar="MCAP", help="recorded rollouts"
+    )
+    parser.add_argument(
+        "--policy", help="checkpoint that played them, where they carry no states themselves"
+    )
+
+
+def draw(arguments: argparse.Namespace) -> Drawn:
+    """Read the rollouts and draw them side by side."""
+    policy = None if arguments.policy is None else _stateful_policy(arguments)
+    episodes = [read_episode(path) for path in arguments.rollouts]
+    activities = [activity.activity_of(episode, policy) for episode in episodes]
+    return Drawn(
+        activity.draw(activities), activity.numbers(activities), activity.table(activities)
+    )
+
+
+def _stateful_policy(arguments: argparse.Namespace) -> StatefulPolicy:
+    policy = make_policy(arguments.policy, config_of(arguments))
+    if not isinstance(policy, StatefulPolicy):
+        raise UserError(f"--policy {arguments.policy} has no states; name a network's checkpoint")
+    return policy

@@ -1,0 +1,71 @@
+"""`vmdnn figure failures`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from actors.tasks.registry import make_task
+from proto.errors import UserError
+from proto.recording import read_episode
+from services.commands.figures.drawn import Drawn
+from services.commands.options import add_config, config_of
+from services.figures import failures
+from services.trial_book import CountedTrial, read_trials
+
+SUMMARY: Final = "where a policy fails, and how it errs at the grasp"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the figure's arguments."""
+    add_config(parser)
+    parser.add_argument(
+        "--outcomes",
+        type=Path,
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="what `vmdnn evaluate --outcomes` wrote, or evaluation/trials.jsonl of a run",
+    )
+    parser.add_argument(
+        "--rollouts", type=Path, nargs="+", default=[], metavar="DIR", help="folders of rollouts"
+    )
+    parser.add_argument("--policy-version", type=int, help="only trials of this version")
+
+
+def draw(arguments: argparse.Namespace) -> Drawn:
+    """Read the trials of one policy and draw where they failed."""
+    found = [
+        trial
+        for trial in _counted_trials(arguments)
+        if arguments.policy_version in {None, trial.policy_version}
+    ]
+    trials = failures.Trials.of(found, make_task(config_of(arguments).task))
+    name, version = _only_policy(found)
+    words = f"{name} version {version}" if version else name
+    return Drawn(
+        failures.draw(trials, f"{words}: {len(found)} trials"),
+        {"policy": name, "policy_version": version, **failures.numbers(trials)},
+        failures.table(trials),
+    )
+
+
+def _counted_trials(arguments: argparse.Namespace) -> Iterator[CountedTrial]:
+    if not arguments.outcomes and not arguments.rollouts:
+        raise UserError("name files of outcomes with --outcomes, or folders with --rollouts")
+    for path in arguments.outcomes:
+        yield from read_trials(path)
+    for folder in arguments.rollouts:
+        for path in sorted(folder.glob("*.mcap")):
+            episode = read_episode(path)
+            yield CountedTrial.of(episode, run_id=episode.policy)
+
+
+def _only_policy(trials: list[CountedTrial]) -> tuple[str, int]:
+    policies = sorted({(trial.run_id, trial.policy_version) for trial in trials})
+    if len(policies) > 1:
+        told = ", ".join(f"{name} version {version}" for name, version in policies)
+        raise UserError(f"these are trials of {told}; choose one, with --policy-version")
+    return policies[0]

@@ -1,0 +1,145 @@
+"""Success against the time constant of the PFC (paper, figure 5)."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from services.figures.style import BLACK, BLUE, GREY, look
+from services.success import READINGS, Rate, Tally, difference95
+from services.sweep import Tested
+
+PAPER: Final[Mapping[float, Rate]] = {30.0: Rate(32, 52), 150.0: Rate(44, 52)}
+"""What the paper published; it counts what is lifted at the end, our `lenient`."""
+PAPERS_TAU: Final = 150.0
+
+Tallies = Mapping[float, Mapping[int, Tally]]
+"""What was counted by time constant and training seed."""
+
+
+def tallies_of(tested: Sequence[Tested]) -> Tallies:
+    """Count the outcomes; both keys are in order."""
+    by_tau: dict[float, dict[int, Tally]] = defaultdict(dict)
+    for each in sorted(tested, key=lambda each: (each.member.tau, each.member.seed)):
+        by_tau[each.member.tau][each.member.seed] = Tally.of(each.outcomes)
+    return by_tau
+
+
+def pooled(tallies: Mapping[int, Tally], reading: str) -> Rate:
+    """The rate over the trials of all seeds."""
+    rates = [tally.rate(reading) for tally in tallies.values()]
+    return Rate(sum(rate.successes for rate in rates), sum(rate.trials for rate in rates))
+
+
+def numbers(tallies: Tallies) -> dict[str, Any]:
+    """All that the figure shows, for `json.dumps`."""
+    return {
+        "time_constants": [
+            {
+                "tau": tau,
+                "trials": sum(tally.trials for tally in by_seed.values()),
+                "pooled": {reading: pooled(by_seed, reading).as_json() for reading in READINGS},
+                "by_seed": {str(seed): tally.as_json() for seed, tally in by_seed.items()},
+                "against_150": {
+                    reading: _against(tallies, tau, reading)
+                    for reading in READINGS
+                    if PAPERS_TAU in tallies and tau != PAPERS_TAU
+                },
+            }
+            for tau, by_seed in tallies.items()
+        ],
+        "paper": {
+            f"{tau:g}": rate.as_json() | {"trials": rate.trials} for tau, rate in PAPER.items()
+        },
+    }
+
+
+def table(tallies: Tallies) -> Table:
+    """Success by time constant, and whether 150 is better."""
+    result = Table(
+        caption="% of all seeds' trials, by seed, and in points against 150, each with its 95 %"
+        " interval; the intervals are of trials: how far networks differ, the seeds tell"
+    )
+    for heading in ("tau", "reading", "all seeds", "by seed", "against 150"):
+        result.add_column(heading, justify="right" if heading == "tau" else "left")
+    for tau, by_seed in tallies.items():
+        for reading in READINGS:
+            rate = pooled(by_seed, reading)
+            low, high = rate.wilson95
+            seeds = ", ".join(f"{100 * tally.rate(reading).rate:.0f}" for tally in by_seed.values())
+            result.add_row(
+                f"{tau:g}" if reading == READINGS[0] else "",
+                reading,
+                f"{100 * rate.rate:.1f} ({100 * low:.1f} to {100 * high:.1f})",
+                seeds,
+                _against_text(tallies, tau, reading),
+            )
+        result.add_section()
+    return result
+
+
+def draw(tallies: Tallies) -> Figure:
+    """One panel for each reading of success, the paper's points beside ours."""
+    with look():
+        figure = Figure(figsize=(8.4, 3.2), layout="constrained")
+        panels = figure.subplots(1, len(READINGS), sharey=True)
+        for axes, reading in zip(panels, READINGS, strict=True):
+            _draw_reading(axes, tallies, reading)
+            axes.set_title(reading)
+            axes.set_xlabel("time constant of the PFC (steps)")
+            axes.set_xticks(sorted({*tallies, *PAPER}))
+            axes.set_ylim(0, 102)
+        panels[0].set_ylabel("success (%)")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        return figure
+
+
+def _draw_reading(axes: Axes, tallies: Tallies, reading: str) -> None:
+    published = "paper (lifted at the end)"
+    _draw_rates(axes, PAPER, -4.0, color=GREY, marker="D", linestyle="none", label=published)
+    rates = {tau: pooled(by_seed, reading) for tau, by_seed in tallies.items()}
+    _draw_rates(axes, rates, 0.0, color=BLUE, marker="o", linewidth=1.0, label="ours, all seeds")
+    places = [(tau, tally) for tau, by_seed in tallies.items() for tally in by_seed.values()]
+    axes.scatter(
+        [tau + 4.0 for tau, _ in places],
+        [100 * tally.rate(reading).rate for _, tally in places],
+        s=10,
+        facecolors="none",
+        edgecolors=BLACK,
+        linewidths=0.6,
+        label="ours, one seed",
+        zorder=3,
+    )
+
+
+def _draw_rates(axes: Axes, rates: Mapping[float, Rate], nudge: float, **look_of: Any) -> None:
+    percent = 100 * np.array([(rate.rate, *rate.wilson95) for rate in rates.values()]).T
+    axes.errorbar(
+        np.array(list(rates)) + nudge,
+        percent[0],
+        yerr=[percent[0] - percent[1], percent[2] - percent[0]],
+        markersize=4,
+        elinewidth=0.9,
+        capsize=2,
+        **look_of,
+    )
+
+
+def _against(tallies: Tallies, tau: float, reading: str) -> dict[str, Any]:
+    rate, papers = pooled(tallies[tau], reading), pooled(tallies[PAPERS_TAU], reading)
+    return {"difference": rate.rate - papers.rate, "interval95": list(difference95(rate, papers))}
+
+
+def _against_text(tallies: Tallies, tau: float, reading: str) -> str:
+    if PAPERS_TAU not in tallies or tau == PAPERS_TAU:
+        return ""
+    found = _against(tallies, tau, reading)
+    low, high = found["interval95"]
+    return f"{100 * found['difference']:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
