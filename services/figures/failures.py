@@ -32,6 +32,7 @@ from services.figures.style import (
     RED,
     label,
     look,
+    percent,
     words_and_unit,
 )
 from services.success import Rate
@@ -144,8 +145,10 @@ class Trials:
 
     def reached(self) -> NDArray[np.bool_]:
         """(N,) whether in addition the hand was about where the object was."""
-        errors = [np.abs(self.error(name)) < SHOWN * most for name, (_, most) in ERRORS.items()]
-        return self.approached() & np.all(errors, axis=0)
+        reached = self.approached()
+        for name, (_, allowed) in ERRORS.items():
+            reached &= np.abs(self.error(name)) < SHOWN * allowed
+        return reached
 
     def error(self, name: str) -> Array:
         """(N,) one of ERRORS."""
@@ -297,12 +300,11 @@ def _draw_rates(axes: Axes, trials: Trials, name: str) -> None:
     centres = np.array([(low + high) / 2 for low, high, _ in bins])
     nudge = 0.02 * float(np.diff(trials.tutored[name]).min())
     for side, reading in enumerate(READINGS):
-        rates = [trials.rate(reading, chosen) for _, _, chosen in bins]
-        percent = 100 * np.array([(rate.rate, *rate.wilson95) for rate in rates]).T
+        middle, reach = percent(trials.rate(reading, chosen) for _, _, chosen in bins)
         axes.errorbar(
             centres + (2 * side - 1) * nudge,
-            percent[0],
-            yerr=[percent[0] - percent[1], percent[2] - percent[0]],
+            middle,
+            yerr=reach,
             color=READING_COLOURS[reading],
             marker="o",
             markersize=3,

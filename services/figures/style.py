@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Final
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from proto.errors import UserError
 from proto.files import written_whole
+from services.success import Rate
+
+Array = NDArray[np.float64]
 
 # Okabe and Ito's colours, which colour-blind people tell apart too.
 BLACK: Final = "#000000"
@@ -46,6 +51,12 @@ _UNITS: Final = {"m": "m", "deg": "degrees", "mm": "mm"}
 def look() -> AbstractContextManager[None]:
     """A context within which figures look alike."""
     return mpl.rc_context(_LOOK)
+
+
+def percent(rates: Iterable[Rate]) -> tuple[Array, Array]:
+    """N rates in percent, (N,), and how far their intervals reach below and above, (2, N)."""
+    middle, low, high = 100 * np.array([(rate.rate, *rate.wilson95) for rate in rates]).T
+    return middle, np.maximum([middle - low, high - middle], 0.0)  # at 0 and 100 % they round
 
 
 def check_name(path: Path) -> None:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from services.figures.style import BLACK, BLUE, GREY, look
+from services.figures.style import BLACK, BLUE, GREY, look, percent
 from services.success import READINGS, Rate, Tally, difference95
 from services.sweep import Tested
 
@@ -120,11 +120,11 @@ def _draw_reading(axes: Axes, tallies: Tallies, reading: str) -> None:
 
 
 def _draw_rates(axes: Axes, rates: Mapping[float, Rate], nudge: float, **look_of: Any) -> None:
-    percent = 100 * np.array([(rate.rate, *rate.wilson95) for rate in rates.values()]).T
+    middle, reach = percent(rates.values())
     axes.errorbar(
         np.array(list(rates)) + nudge,
-        percent[0],
-        yerr=[percent[0] - percent[1], percent[2] - percent[0]],
+        middle,
+        yerr=reach,
         markersize=4,
         elinewidth=0.9,
         capsize=2,

@@ -1,0 +1,107 @@
+"""What goes on in a network can be drawn for any rollout that its checkpoint played."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from learner.policy import NetworkPolicy
+from proto.episode import Episode
+from proto.errors import UserError
+from proto.recording import read_episode, write_episode
+from services.cli import main
+from services.figures.activity import UNITS_SHOWN, Activity, activity_of, difference_by_phase
+
+UNITS = {"mstnn_fast": 1188, "mstnn_slow": 336, "pfc": 20, "mtrnn_slow": 30, "mtrnn_fast": 50}
+
+
+@pytest.fixture(scope="module")
+def rollouts(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Two rollouts of one network, the first with its states."""
+    folder = tmp_path_factory.mktemp("rollouts")
+    situation = "obstacle_x_m=-0.27,object_y_m=0.25,object_yaw_deg="
+    evaluate = f"evaluate --policy {checkpoint} --workers 1"
+    for name, words in (("with", "=44 --states"), ("without", "=-44")):
+        command = f"{evaluate} --situation {situation[:-1]}{words} --out {folder / name}"
+        assert main(command.split()) == 0
+    return [folder / name / "trial0000.mcap" for name in ("with", "without")]
+
+
+def test_one_command_draws_two_rollouts_and_says_how_they_differ(
+    rollouts: list[Path], checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "activity.png"
+    told = " ".join(map(str, rollouts))
+    command = f"figure activity --rollouts {told} --policy {checkpoint} --out {out} --json"
+    assert main(command.split()) == 0
+    assert out.read_bytes().startswith(b"\x89PNG")
+    numbers = json.loads(capsys.readouterr().out)
+    episode = read_episode(rollouts[0])
+    assert {name: len(units) for name, units in numbers["units"].items()} == {
+        "mstnn_fast": UNITS_SHOWN,
+        "pfc": 20,
+        "mtrnn_fast": UNITS_SHOWN,
+    }
+    first = numbers["rollouts"][0]
+    assert first["situation"]["object_yaw_deg"] == 44
+    assert [episode.phases[start] for start in first["phase_starts"]] == list(range(1, 9))
+    assert np.shape(first["activity"]["pfc"]) == (episode.steps, 20)
+    assert {len(apart) for apart in numbers["difference_by_phase"].values()} == {8}
+
+
+def test_states_are_the_same_recorded_or_computed_from_what_was_seen(
+    rollouts: list[Path], checkpoint: Path
+) -> None:
+    episode = read_episode(rollouts[0])
+    recorded = activity_of(episode, None).states
+    computed = activity_of(episode, NetworkPolicy.from_file(checkpoint)).states
+    assert {name: activity.shape for name, activity in recorded.items()} == {
+        name: (episode.steps, units) for name, units in UNITS.items()
+    }
+    assert all(np.array_equal(recorded[name], computed[name]) for name in UNITS)
+
+
+def test_a_rollout_without_states_says_how_to_get_them(
+    rollouts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = f"figure activity --rollouts {rollouts[1]} --out {tmp_path / 'a.png'}"
+    assert main(command.split()) == 2
+    assert "vmdnn evaluate --states" in capsys.readouterr().err
+
+
+def test_the_policy_of_another_rollout_is_refused(
+    rollouts: list[Path], checkpoint: Path, tmp_path: Path
+) -> None:
+    episode = read_episode(rollouts[1])
+    assert episode.outputs is not None
+    foreign = replace(episode, outputs=episode.outputs[::-1].copy())
+    write_episode(tmp_path / "foreign.mcap", foreign)
+    with pytest.raises(UserError, match="not by this policy"):
+        activity_of(read_episode(tmp_path / "foreign.mcap"), NetworkPolicy.from_file(checkpoint))
+
+
+def test_a_policy_without_states_and_a_file_that_is_no_png_are_named(
+    rollouts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = f"figure activity --rollouts {rollouts[0]} --out {tmp_path / 'a.png'} --policy tutor"
+    assert main(command.split()) == 2
+    assert "--policy tutor has no states" in capsys.readouterr().err
+    assert main(f"figure activity --rollouts {rollouts[0]} --out {tmp_path / 'a.pdf'}".split()) == 2
+    assert "ends in .png" in capsys.readouterr().err
+
+
+def test_rollouts_differ_in_the_phases_in_which_they_differ(
+    make_episode: Callable[..., Episode],
+) -> None:
+    episode = make_episode(6, phases=np.array([1, 1, 2, 2, 3, 3], np.uint8))
+    names = ("mstnn_fast", "pfc", "mtrnn_fast")
+    still = {name: np.zeros((6, 4), np.float32) for name in names}
+    moved = {name: np.zeros((6, 4), np.float32) for name in names}
+    moved["pfc"][2:4] = 0.5
+    apart = difference_by_phase(Activity(episode, still), Activity(episode, moved))
+    assert apart == {"mstnn_fast": [0, 0, 0], "pfc": [0, 0.5, 0], "mtrnn_fast": [0, 0, 0]}

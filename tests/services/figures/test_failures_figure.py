@@ -1,0 +1,132 @@
+"""The figure of failures tells a policy that snaps to what it was taught from one that does not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from actors.tasks.experiment1 import GRID, Experiment1
+from proto.episode import Outcome, Reason
+from proto.errors import UserError
+from services.cli import main
+from services.figures.failures import POSITION, YAW, Trials, numbers, snapping
+from services.trial_book import CountedTrial
+
+Believes = Callable[[str, float], float]
+
+
+def nearest(name: str, value: float) -> float:
+    return min(GRID[name], key=lambda taught: abs(taught - value))
+
+
+def outcome(situation: Mapping[str, float], believes: Believes) -> Outcome:
+    """How a policy fares whose hand goes where it believes the object is."""
+    yaw = situation[YAW]
+    yaw_error = believes(YAW, yaw) - yaw
+    offset_mm = 1e3 * (believes(POSITION, situation[POSITION]) - situation[POSITION])
+    along, across = offset_mm * np.cos(np.deg2rad(yaw)), -offset_mm * np.sin(np.deg2rad(yaw))
+    precise = abs(yaw_error) <= 10 and abs(along) <= 20 and abs(across) <= 10
+    reason = Reason.NONE if precise else Reason.IMPRECISE
+    return Outcome(True, True, precise, reason, 0.1, 0, 0, yaw_error, along, across, 80, -1)
+
+
+def play(believes: Believes, count: int = 400, version: int = 1) -> list[CountedTrial]:
+    situations = [Experiment1().sample(seed) for seed in range(count)]
+    return [
+        CountedTrial("run", version, seed, f"e{seed}", "local", each, outcome(each, believes))
+        for seed, each in enumerate(situations)
+    ]
+
+
+def write(path: Path, trials: Sequence[CountedTrial]) -> Path:
+    path.write_bytes(b"".join(trial.line() for trial in trials))
+    return path
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.8])
+@pytest.mark.parametrize("name", [YAW, POSITION])
+def test_the_share_of_snapping_is_found_beside_other_errors(name: str, share: float) -> None:
+    random = np.random.default_rng(7)
+    middle = {YAW: 0.0, POSITION: 0.25}
+    noise = {YAW: 0.5, POSITION: 0.0005}
+
+    def believes(asked: str, value: float) -> float:
+        if asked != name:
+            return value
+        pulled = value + 0.1 * (middle[name] - value)  # to the middle of the range
+        snapped = pulled + share * (nearest(name, value) - value)
+        return snapped + noise[name] * random.normal()
+
+    found = snapping(Trials.of(play(believes), Experiment1()), name)
+    assert found is not None
+    assert found.share == pytest.approx(share, abs=0.03)
+    assert found.half_width < 0.06
+
+
+def test_success_near_tutored_values_and_between_them_is_told_apart() -> None:
+    found = numbers(Trials.of(play(nearest), Experiment1()))
+    for name in (YAW, POSITION):
+        places = found["near_and_between"][name]
+        assert places["near"]["precise"]["rate"] > places["between"]["precise"]["rate"] + 0.1
+    for name in GRID:
+        bins = found["by_value"][name]
+        assert len(bins) == 2 * len(GRID[name]) - 1  # tutored values and gaps, by turns
+        assert sum(part["strict"]["trials"] for part in bins) == found["trials"] == 400
+        assert (bins[0]["from"], bins[-1]["to"]) == (min(GRID[name]), max(GRID[name]))
+
+
+def test_one_command_draws_what_evaluate_wrote(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out = write(tmp_path / "outcomes.jsonl", play(nearest, 60)), tmp_path / "failures.png"
+    assert main(f"figure failures --outcomes {path} --out {out} --json".split()) == 0
+    assert out.read_bytes().startswith(b"\x89PNG")
+    told = json.loads(capsys.readouterr().out)
+    assert (told["policy"], told["policy_version"], told["trials"]) == ("run", 1, 60)
+    assert told["snapping"].keys() == {YAW, POSITION}
+
+
+def test_recorded_rollouts_serve_as_well(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "failures.png"
+    assert main(f"figure failures --rollouts {recordings} --out {out}".split()) == 0
+    assert out.exists()
+    assert "snapping" in capsys.readouterr().out
+
+
+def test_versions_are_not_thrown_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trials = [*play(nearest, 20), *play(nearest, 10, version=2)]
+    path, out = write(tmp_path / "trials.jsonl", trials), tmp_path / "failures.png"
+    assert main(f"figure failures --outcomes {path} --out {out}".split()) == 2
+    assert "run version 1, run version 2" in capsys.readouterr().err
+    chosen = f"figure failures --outcomes {path} --out {out} --policy-version 2 --json"
+    assert main(chosen.split()) == 0
+    assert json.loads(capsys.readouterr().out)["trials"] == 10
+
+
+def test_what_holds_no_trials_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "failures.png"
+    (tmp_path / "other.jsonl").write_text('{"a": 1}\n')
+    for words, message in (
+        (f"--outcomes {tmp_path / 'missing'}", "cannot be read"),
+        (f"--outcomes {tmp_path / 'other.jsonl'}", "holds no outcomes"),
+        (f"--rollouts {tmp_path}", "no trial"),
+        ("", "--outcomes"),
+    ):
+        assert main(f"figure failures --out {out} {words}".split()) == 2
+        assert message in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_trials_of_another_task_are_refused() -> None:
+    (trial,) = play(nearest, 1)
+    foreign = CountedTrial("run", 1, 0, "e", "local", {"object_y_m": 0.2}, trial.outcome)
+    with pytest.raises(UserError, match="a situation has"):
+        Trials.of([foreign], Experiment1())

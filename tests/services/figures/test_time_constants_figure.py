@@ -1,0 +1,77 @@
+"""Networks of several time constants are trained, tested and drawn, each of them once."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from learner.store import TutoringStore
+from proto.config import Config, load_config
+from services import sweep
+from services.cli import main
+from services.success import Rate, difference95
+
+QUICK = (
+    "--set learner.pretraining.epochs=1 --set learner.epochs=2 --set learner.warmup_epochs=1"
+    " --tau 30 150 --seeds 1 --trials 1 --workers 1 --json"
+)
+
+
+def draw(recordings: Path, out: Path, words: str = "") -> int:
+    command = f"figure time-constants --data {recordings} --out {out} {QUICK} {words}"
+    return main(command.split())
+
+
+def everything(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_one_command_trains_tests_and_draws_and_does_nothing_twice(
+    recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "five.png"
+    assert draw(recordings, out) == 0
+    assert out.read_bytes().startswith(b"\x89PNG")
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert [(each["tau"], each["trials"]) for each in told["time_constants"]] == [(30, 1), (150, 1)]
+    assert told["time_constants"][0]["against_150"].keys() == {"lenient", "strict", "precise"}
+    assert {tau: rate["successes"] for tau, rate in told["paper"].items()} == {"30": 32, "150": 44}
+    kept = everything(tmp_path / "five")
+    saved = load_config(tmp_path / "five" / "tau30_seed1" / "config.yaml")
+    assert (saved.network.pfc.tau, saved.run.seed) == (30, 1)
+
+    assert draw(recordings, out) == 0
+    assert json.loads(capsys.readouterr().out) == told
+    assert everything(tmp_path / "five") == kept
+
+    assert draw(recordings, out, "--trials 2 --tau 30") == 0
+    (more,) = json.loads(capsys.readouterr().out)["time_constants"]
+    assert more["trials"] == 2
+    name = Path("five", "tau30_seed1", "trials.jsonl")
+    first, second = (tmp_path / name).read_bytes().splitlines(keepends=True)
+    assert first == kept[tmp_path / name], "what was counted is not played again"
+    assert first != second
+
+    assert draw(recordings, out, "--set learner.rate=1e-3") == 2
+    assert "another config" in capsys.readouterr().err
+
+
+def test_a_training_that_was_stopped_goes_on(recordings: Path, tmp_path: Path) -> None:
+    values = {"learner": {"pretraining": {"epochs": 1}, "epochs": 2, "warmup_epochs": 1}}
+    (member,) = sweep.members_of(Config.model_validate(values), [30], [1], tmp_path)
+    store = TutoringStore(recordings)
+    done = [sweep.epochs_done(member)]
+    while not sweep.train(member, store, None, lambda _loss: False):
+        done.append(sweep.epochs_done(member))
+    done.append(sweep.epochs_done(member))
+    assert done == [0, 1, 2, 3]
+    assert done[-1] == sweep.epochs_of(member)
+
+
+def test_the_interval_of_a_difference_is_newcombes() -> None:
+    """The example of Newcombe's paper: 56 of 70 against 48 of 80."""
+    low, high = difference95(Rate(56, 70), Rate(48, 80))
+    assert (low, high) == (pytest.approx(0.0524, abs=1e-4), pytest.approx(0.3339, abs=1e-4))
