@@ -153,7 +153,7 @@ class PretrainingConfig(_Section):
     task: Literal["reaching"] | None = "reaching"
     cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
     repeats: Count = 4
-    start_sequences: Count = 15
+    start_sequences: Count = 60
     epochs: Annotated[int, Field(ge=0)] = 300
     rate: Positive = 2e-3
     batch: Count = 15
