@@ -85,6 +85,14 @@ def playing_config(arguments: argparse.Namespace, overrides: Sequence[str] = ())
     return load_config(arguments.config, [*arguments.overrides, *named, *overrides])
 
 
+def seed(text: str) -> int:
+    """A whole number of at least zero, for `type=` of an argument."""
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{text} is less than 0")
+    return number
+
+
 def positive(text: str) -> int:
     """A whole number of at least one, for `type=` of an argument."""
     number = int(text)

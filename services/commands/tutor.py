@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from actors.tasks.registry import make_task
-from services.commands.options import add_config, add_playing, playing_config, positive
+from services.commands.options import add_config, add_playing, playing_config, positive, seed
 from services.progress import progress_bar
 from services.success import Tally
 from services.tables import success_table
@@ -28,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--seed",
-        type=int,
+        type=seed,
         default=100_000,
         help="of random cases, one after the other; trials of a policy have seeds of their own",
     )
