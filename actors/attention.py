@@ -25,7 +25,7 @@ def crop_of_focus(level: float) -> Crop:
 
 def clip_action(action: Array) -> Array:
     """Actions (..., 11) within the robot's limits."""
-    return np.clip(action, _MINIMUM, _MAXIMUM)
+    return np.asarray(action.clip(_MINIMUM, _MAXIMUM))
 
 
 def targets_of_action(action: Array) -> JointTargets:

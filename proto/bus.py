@@ -158,7 +158,7 @@ class Bus:
         """Whether anyone subscribes to a key, as far as this process knows by now."""
         if key not in self._watched:
             self._watched[key] = self._session.declare_publisher(key)
-        return self._watched[key].matching_status.matching
+        return bool(self._watched[key].matching_status.matching)  # type: ignore[attr-defined]
 
     def publish(self, key: str, message: Any, *, check: bool = True) -> None:
         """Publish a message that may be lost, also because it is wrong and was not checked."""

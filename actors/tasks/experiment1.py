@@ -166,12 +166,15 @@ def _object(situation: Situation) -> Box:
 
 @dataclass(frozen=True)
 class _Instant:
-    """What the judge keeps of one control step; it must cost little, what follows from it may."""
+    """What the judge keeps of one control step; what follows from it is worked out at the end."""
 
-    closing: float
+    joints_deg: Array
     touched: bool
-    body: Pose
-    hand: Pose
+    bodies: Mapping[str, Pose]
+
+    @property
+    def closing(self) -> float:
+        return closing_fraction(self.joints_deg[9:])
 
 
 @dataclass(frozen=True)
@@ -195,14 +198,8 @@ class Experiment1Judge:
 
     def watch(self, report: StepReport, joints_deg: Array, bodies: Mapping[str, Pose]) -> None:
         """Take note of one control step that has just been run."""
-        self._instants.append(
-            _Instant(
-                closing=closing_fraction(joints_deg[9:]),
-                touched=any(box == "obstacle" for box, _ in report.touches),
-                body=bodies["object"],
-                hand=bodies[HAND],
-            )
-        )
+        touched = any(box == "obstacle" for box, _ in report.touches)
+        self._instants.append(_Instant(joints_deg, touched, bodies))
 
     def outcome(self) -> Outcome:
         """How the episode went, once its last step was watched."""
@@ -244,14 +241,15 @@ class Experiment1Judge:
         )
 
     def _lifted_m(self, instant: _Instant) -> float:
-        return instant.body.position_m[2] - self._start.position_m[2]
+        return instant.bodies["object"].position_m[2] - self._start.position_m[2]
 
     def _approach(self, instant: _Instant) -> _Approach:
-        moved = np.subtract(instant.body.position_m, self._start.position_m)
-        yaw = _yaw_deg(instant.body)
-        axis, grasp_centre = _grasp(instant.hand)
+        body = instant.bodies["object"]
+        moved = np.subtract(body.position_m, self._start.position_m)
+        yaw = _yaw_deg(body)
+        axis, grasp_centre = _grasp(instant.bodies[HAND])
         hand_yaw = float(np.rad2deg(np.arctan2(axis[1], axis[0])))
-        centre = grasp_centre - instant.body.position_m
+        centre = grasp_centre - body.position_m
         turn = np.deg2rad(yaw)
         return _Approach(
             moved_mm=1e3 * float(np.hypot(moved[0], moved[1])),
