@@ -117,9 +117,14 @@ class SteppingNetwork:
 
         The units of V_F and V_S are ordered by map, row and column.
         """
-        maps = {"mstnn_fast": self._mstnn_fast, "mstnn_slow": self._mstnn_slow}
-        levels = zip(("pfc", "mtrnn_slow", "mtrnn_fast"), self._levels, strict=True)
-        return {name: each.activity() for name, each in (*maps.items(), *levels)}
+        pfc, mtrnn_slow, mtrnn_fast = self._levels
+        return {
+            "mstnn_fast": self._mstnn_fast.activity(),
+            "mstnn_slow": self._mstnn_slow.activity(),
+            "pfc": pfc.activity(),
+            "mtrnn_slow": mtrnn_slow.activity(),
+            "mtrnn_fast": mtrnn_fast.activity(),
+        }
 
 
 class _Maps:

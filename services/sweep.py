@@ -11,6 +11,8 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from learner.checkpoint import load_checkpoint, policy_file, training_file
 from learner.offline import open_training, run_training
 from learner.store import TutoringStore
@@ -143,7 +145,10 @@ def _config(config: Config, tau: float, seed: int, folder: Path) -> Config:
         update={"name": f"tau{tau:g}_seed{seed}", "folder": folder, "seed": seed}
     )
     changed = config.model_copy(update={"network": network, "run": run})
-    return Config.model_validate(changed.model_dump())  # model_copy checks nothing
+    try:
+        return Config.model_validate(changed.model_dump())  # model_copy checks nothing
+    except ValidationError as error:
+        raise UserError(f"tau {tau:g}, seed {seed}: {error.errors()[0]['msg']}") from error
 
 
 def _claim(member: Member) -> None:

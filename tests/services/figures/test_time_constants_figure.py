@@ -57,6 +57,8 @@ def test_one_command_trains_tests_and_draws_and_does_nothing_twice(
 
     assert draw(recordings, out, "--set learner.rate=1e-3") == 2
     assert "another config" in capsys.readouterr().err
+    assert draw(recordings, out, "--tau 0.5") == 2
+    assert "tau 0.5, seed 1" in capsys.readouterr().err
 
 
 def test_a_training_that_was_stopped_goes_on(recordings: Path, tmp_path: Path) -> None:
