@@ -7,6 +7,7 @@ sequence is computed once, when the sequence comes in.
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -32,10 +33,22 @@ class CoupledTraining:
         parameters: what is trained: everything but the vision.
     """
 
-    def __init__(self, network: VMDNN, code: SoftmaxCode) -> None:
+    def __init__(
+        self, network: VMDNN, code: SoftmaxCode, vision_noise: float, generator: torch.Generator
+    ) -> None:
+        """Begin without sequences.
+
+        Args:
+            network: the network, of which the vision stays as it is.
+            code: how the outputs code actions.
+            vision_noise: disturbance of V_S, see `LearnerConfig`.
+            generator: draws it.
+        """
         self.code = code
         self.parameters = network.coupled_parameters()
         self._network = network
+        self._vision_noise = vision_noise
+        self._generator = generator
         self._seen: list[Tensor] = []
         self._codes: list[Tensor] = []
         self._targets: list[Floats] = []
@@ -58,7 +71,22 @@ class CoupledTraining:
         """Mean divergence of eq. (5), for the sequences with these indices."""
         if self._sequences is None:
             self._sequences = Sequences.stacked(self._seen, self._codes)
-        return divergence(self._network, self._sequences, chosen)
+            self._spread = self._sequences.seen.std((0, 1))
+        if self._vision_noise == 0:
+            return divergence(self._network, self._sequences, chosen)
+        disturbed = self._disturbed(self._sequences.chosen(chosen))
+        return divergence(self._network, disturbed, torch.arange(len(chosen)))
+
+    def _disturbed(self, sequences: Sequences) -> Sequences:
+        """Sequences each seen a little wrongly, in one way from its start to its end.
+
+        Between the tutored situations the network so sees what it has learned to act on, and
+        interpolates instead of snapping to the nearest of them.
+        """
+        shape = (len(sequences.seen), 1, len(self._spread))
+        wrong = torch.randn(shape, generator=self._generator)
+        seen = sequences.seen + self._vision_noise * self._spread * wrong
+        return replace(sequences, seen=seen)
 
     def mean_errors(self) -> NDArray[np.float64]:
         """(11,) mean distance of the decoded outputs from the targets, over all sequences."""

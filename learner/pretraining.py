@@ -19,6 +19,7 @@ from learner.loss import kl_divergence
 from learner.mtrnn import run_levels
 from learner.vision_input import vision_input
 from learner.vmdnn import VMDNN
+from proto.config import PretrainingConfig
 from proto.episode import Episode, Image
 
 Classes = Mapping[str, tuple[float, ...]]
@@ -46,7 +47,7 @@ class Pretraining:
         self,
         network: VMDNN,
         classes: Classes,
-        answer_part: float,
+        config: PretrainingConfig,
         generator: torch.Generator,
     ) -> None:
         """Put the temporary layer on the network.
@@ -54,12 +55,13 @@ class Pretraining:
         Args:
             network: the network whose vision is to be formed.
             classes: what is asked for; not empty.
-            answer_part: last part of a sequence in which the answer is asked for, 0..1.
-            generator: draws the temporary layer's weights.
+            config: when the answer is asked for, and how pictures are disturbed.
+            generator: draws the temporary layer's weights and the disturbance.
         """
         self.classes = classes
         self._network = network
-        self._answer_part = answer_part
+        self._config = config
+        self._generator = generator
         self._images: list[Image] = []
         self._labels: list[NDArray[np.float32]] = []
         self._counts = [len(centres) for centres in classes.values()]
@@ -108,13 +110,34 @@ class Pretraining:
     def _see(self, images: Sequence[Image]) -> Tensor:
         """V_S (B, T, units) for pictures of any lengths T; filled up at the end with black."""
         grey = nn.utils.rnn.pad_sequence([torch.from_numpy(each) for each in images], True)
-        return self._network.see(torch.from_numpy(vision_input(grey.numpy())))
+        return self._network.see(self._disturbed(torch.from_numpy(vision_input(grey.numpy()))))
+
+    def _disturbed(self, images: Tensor) -> Tensor:
+        """Images (B, T, H, W), those of each sequence shifted, brightened and with noise.
+
+        Few situations are tutored; without this the vision learns them by heart.
+        """
+        config, generator = self._config, self._generator
+        batch, _, height, width = images.shape
+        reach = config.image_shift
+        padded = functional.pad(images, (reach,) * 4, mode="replicate")
+        corners = torch.randint(2 * reach + 1, (batch, 2), generator=generator).tolist()
+        shifted = torch.stack(
+            [
+                one[:, top : top + height, left : left + width]
+                for one, (top, left) in zip(padded, corners, strict=True)
+            ]
+        )
+        gain, offset = config.image_gain * torch.randn(2, batch, 1, 1, 1, generator=generator)
+        noise = config.image_noise * torch.randn(shifted.shape, generator=generator)
+        disturbed: Tensor = shifted * (1 + gain) + offset + noise
+        return disturbed
 
     def _asked(self, lengths: Sequence[int]) -> Tensor:
         """(B, T) one in the last part of each sequence, where the answer is asked for."""
         steps = torch.arange(max(lengths))
         ends = torch.tensor(lengths)[:, None]
-        starts = (ends * (1 - self._answer_part)).floor()
+        starts = (ends * (1 - self._config.answer_part)).floor()
         return ((steps >= starts) & (steps < ends)).float()
 
 

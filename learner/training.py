@@ -241,11 +241,15 @@ class Trainer:
             return self._pretraining(classes_of(episodes, labels))
         targets = np.concatenate([episode.targets for episode in episodes])
         code = SoftmaxCode.of_actions(targets, self._config.network)
-        return CoupledTraining(self.network, code)
+        return self._coupled_training(code)
 
     def _pretraining(self, classes: Classes) -> Pretraining:
-        answer_part = self._config.learner.pretraining.answer_part
-        return Pretraining(self.network, classes, answer_part, self._generator)
+        config = self._config.learner.pretraining
+        return Pretraining(self.network, classes, config, self._generator)
+
+    def _coupled_training(self, code: SoftmaxCode) -> CoupledTraining:
+        vision_noise = self._config.learner.vision_noise
+        return CoupledTraining(self.network, code, vision_noise, self._generator)
 
     def _coupled(self) -> CoupledTraining:
         if not isinstance(self._lesson, CoupledTraining):
@@ -274,7 +278,7 @@ class Trainer:
     ) -> Pretraining | CoupledTraining | None:
         code = metadata.softmax_code()
         if code is not None:
-            return CoupledTraining(self.network, code)
+            return self._coupled_training(code)
         return self._pretraining(training.classes) if training.classes else None
 
     def _metadata(self, training: TrainingMetadata | None) -> CheckpointMetadata:

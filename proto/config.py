@@ -154,7 +154,7 @@ class PretrainingConfig(_Section):
     cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
     repeats: Count = 4
     start_sequences: Count = 60
-    epochs: Annotated[int, Field(ge=0)] = 300
+    epochs: Annotated[int, Field(ge=0)] = 30
     rate: Positive = 2e-3
     batch: Count = 15
     # values of the situation that are asked for, and in how many classes
@@ -164,6 +164,11 @@ class PretrainingConfig(_Section):
     }
     # last part of a sequence in which the answer is asked for
     answer_part: Annotated[float, Field(gt=0, le=1)] = 0.25
+    # disturbance of the pictures, another one for each sequence and epoch: largest shift in pixels,
+    # standard deviations of contrast and brightness, and of each pixel (brightness is -1..1)
+    image_shift: Annotated[int, Field(ge=0)] = 3
+    image_gain: NotNegative = 0.05
+    image_noise: NotNegative = 0.03
 
 
 class LearnerConfig(_Section):
@@ -177,16 +182,19 @@ class LearnerConfig(_Section):
     cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
     lease_s: Positive = 60.0
     start_sequences: Count = 45
-    epochs: Count = 2500
+    epochs: Count = 400
     rate: Positive = 3e-3
     schedule: Literal["constant", "cosine"] = "cosine"
-    warmup_epochs: Annotated[int, Field(ge=0)] = 50
-    batch: Count = 60
+    warmup_epochs: Annotated[int, Field(ge=0)] = 12
+    batch: Count = 30
     clip_norm: Positive | None = 1.0
+    # in coupled training: disturbance of each unit of V_S, another one for each sequence and epoch,
+    # in standard deviations of the unit's activity
+    vision_noise: NotNegative = 0.3
     initial_range: Positive = 0.1
     initial_range_pfc_input: Positive = 0.2
-    checkpoint_every_epochs: Count = 100
-    publish_every_epochs: Count = 250
+    checkpoint_every_epochs: Count = 50
+    publish_every_epochs: Count = 50
     threads: Count = 1
     pretraining: PretrainingConfig = PretrainingConfig()
 

@@ -74,7 +74,12 @@ def small_config() -> Callable[..., Config]:
                     "epochs": 6,
                     "warmup_epochs": 2,
                     "batch": 3,
-                    "pretraining": {"epochs": pretraining, "batch": 3},
+                    "pretraining": {
+                        "epochs": pretraining,
+                        "batch": 3,
+                        "image_shift": 0,
+                        "image_gain": 0.0,
+                    },
                     **learner,
                 },
             }
