@@ -14,12 +14,16 @@ from learner.vmdnn import VMDNN
 
 
 def divergence(
-    network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor | None = None
+    network: VMDNN,
+    sequences: Sequences,
+    chosen: Tensor,
+    initial: Tensor | None = None,
+    shift: Tensor | None = None,
 ) -> Tensor:
     """Mean divergence of eq. (5), for the sequences with these indices.
 
-    Differentiable once by the network's coupled parameters, what was seen and `initial`; by the
-    compiled kernel where there is one.
+    Differentiable once by the coupled parameters, what was seen, `initial` and `shift`; by
+    the compiled kernel where there is one.
 
     Args:
         network: the network, of which the vision is not used.
@@ -27,15 +31,23 @@ def divergence(
         chosen: (B,) which of them.
         initial: (B, units of PFC, M_S and M_F) their potentials before the first step; without it
             zero, the neutral state.
+        shift: (B, V_S units) what is added to all that was seen.
     """
     if cpu.serves(sequences):
-        return cpu.divergence(network, sequences, chosen, initial)
-    return reference_divergence(network, sequences, chosen, initial)
+        return cpu.divergence(network, sequences, chosen, initial, shift)
+    return reference_divergence(network, sequences, chosen, initial, shift)
 
 
 def reference_divergence(
-    network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor | None = None
+    network: VMDNN,
+    sequences: Sequences,
+    chosen: Tensor,
+    initial: Tensor | None = None,
+    shift: Tensor | None = None,
 ) -> Tensor:
     """What `divergence` means, in PyTorch."""
-    log_outputs = network.act(sequences.seen[chosen], initial)
+    seen = sequences.seen[chosen]
+    if shift is not None:
+        seen = seen + shift[:, None]
+    log_outputs = network.act(seen, initial)
     return kl_divergence(log_outputs, sequences.codes[chosen], sequences.mask[chosen])

@@ -29,10 +29,17 @@ Step = Callable[[VMDNN, Tensor, State], State]
 
 
 def plain_divergence(
-    network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor | None = None
+    network: VMDNN,
+    sequences: Sequences,
+    chosen: Tensor,
+    initial: Tensor | None = None,
+    shift: Tensor | None = None,
 ) -> Tensor:
     """`learner.divergence.divergence`, step by step."""
-    log_outputs = plain_outputs(network, sequences.seen[chosen], initial)
+    seen = sequences.seen[chosen]
+    if shift is not None:
+        seen = seen + shift[:, None]
+    log_outputs = plain_outputs(network, seen, initial)
     return kl_divergence(log_outputs, sequences.codes[chosen], sequences.mask[chosen])
 
 

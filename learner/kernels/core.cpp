@@ -149,12 +149,14 @@ struct Problem {
   const Real* target_entropies;  // (S, T) sum of targets * log(targets)
   const Real* mask;              // (S, T)
   const Real* initial;           // (B, all units) potentials before the first step; null: zero
+  const Real* shift;             // (B, units of the PFC) added to what V_S brings there, or null
   // Of each level: input, recurrent, feedback (but the last), bias; of the outputs: input, bias.
   const Real* parameters;
   double* divergence;
   Real* by_parameters;  // null: only the divergence is asked for
   Real* by_drive;       // (B, T, units of the PFC) by what V_S brings to the PFC, or null
   Real* by_initial;     // (B, all units), or null
+  Real* by_shift;       // (B, units of the PFC), or null
 };
 
 struct Level {
@@ -272,6 +274,7 @@ class Pass {
   bool claim(Task& task);
   void finish(const Task& task);
   void project(const Group& group, int chunk, const Scratch& scratch) const;
+  void gather_shift(const Group& group, Vec* shift) const;
   void scan_forward(Group& group, const Scratch& scratch) const;
   void start_rows(Group& group, Vec* potentials) const;
   void outputs(const Group& group, int chunk, const Scratch& scratch) const;
@@ -281,6 +284,7 @@ class Pass {
   void sum_gradients(const Group& group, int first, int end) const;
   void give_initial(const Group& group) const;
   void give_drive(const Group& group) const;
+  void give_shift(const Group& group) const;
   void inputs(const Group& group, int chunk, const Scratch& scratch) const;
   void add_up() const;
 
@@ -526,6 +530,8 @@ template <typename Real>
 void Pass<Real>::project(const Group& group, int chunk, const Scratch& scratch) const {
   const Level& pfc = levels_.front();
   const int end = std::min((chunk + 1) * kChunk, group.steps);
+  Vec* shift = scratch.potentials;
+  gather_shift(group, shift);
   for (int t = chunk * kChunk; t < end; ++t) {
     Vec* drive = group.hidden + std::ptrdiff_t(t + 1) * width_;
     const bool sees = t >= lag_;
@@ -540,11 +546,23 @@ void Pass<Real>::project(const Group& group, int chunk, const Scratch& scratch) 
       Vec sums[kTile];
       for (int i = 0; i < kTile; ++i) sums[i] = Vec{} + packed_bias_[tile + i];
       if (sees) {
+        for (int i = 0; i < kTile; ++i) sums[i] += shift[tile + i];
         add_product<Real>(packed_inputs_ + std::ptrdiff_t(tile) * problem_.inputs, problem_.inputs,
                           scratch.inputs, sums);
       }
       for (int i = 0; i < kTile; ++i) drive[tile + i] = sums[i];
     }
+  }
+}
+
+template <typename Real>
+void Pass<Real>::gather_shift(const Group& group, Vec* shift) const {
+  const Level& pfc = levels_.front();
+  std::fill(shift, shift + pfc.padded, Vec{});
+  if (problem_.shift == nullptr) return;
+  for (int lane = 0; lane < kLanes; ++lane) {
+    const Real* given = problem_.shift + std::ptrdiff_t(group.member[lane]) * pfc.units;
+    for (int i = 0; i < pfc.units; ++i) shift[i][lane] = Real(pfc.scale) * given[i];
   }
 }
 
@@ -706,6 +724,7 @@ void Pass<Real>::scan_backward(Group& group) const {
     give_initial(group);
   }
   if (problem_.by_drive != nullptr) give_drive(group);
+  if (problem_.by_shift != nullptr) give_shift(group);
 }
 
 // deltas[row] = dE/dv: eq. (6), with the paths inside a step added.
@@ -775,6 +794,21 @@ void Pass<Real>::give_drive(const Group& group) const {
       for (int i = 0; i < pfc.units; ++i) {
         *given++ = used ? Real(pfc.scale) * deltas[i][lane] : Real(0);
       }
+    }
+  }
+}
+
+template <typename Real>
+void Pass<Real>::give_shift(const Group& group) const {
+  const Level& pfc = levels_.front();
+  for (int i = 0; i < pfc.units; ++i) {
+    Vec total{};
+    for (int row = 1 + lag_; row <= group.steps; ++row) {
+      total += group.deltas[std::ptrdiff_t(row) * width_ + pfc.start + i];
+    }
+    for (int lane = 0; lane < group.members; ++lane) {
+      problem_.by_shift[std::ptrdiff_t(group.member[lane]) * pfc.units + i] =
+          Real(pfc.scale) * total[lane];
     }
   }
 }

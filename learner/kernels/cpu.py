@@ -25,8 +25,18 @@ _COUNTS: Final = (
     *("literal", "sequences", "steps", "threads"),
 )
 _ARRAYS: Final = (
-    *("units", "leaks", "chosen", "seen", "targets", "target_entropies", "mask", "initial"),
-    *("parameters", "divergence", "by_parameters", "by_drive", "by_initial"),
+    *(
+        "units",
+        "leaks",
+        "chosen",
+        "seen",
+        "targets",
+        "target_entropies",
+        "mask",
+        "initial",
+        "shift",
+    ),
+    *("parameters", "divergence", "by_parameters", "by_drive", "by_initial", "by_shift"),
 )
 
 
@@ -46,10 +56,16 @@ def serves(sequences: Sequences) -> bool:
 
 
 def divergence(
-    network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor | None = None
+    network: VMDNN,
+    sequences: Sequences,
+    chosen: Tensor,
+    initial: Tensor | None = None,
+    shift: Tensor | None = None,
 ) -> Tensor:
     """`learner.divergence.divergence`, computed by the kernel."""
-    differentiable = (initial, sequences.seen, *network.core_parameters())
+    # The kernel reads what was seen where it lies; that all of it is shifted it learns in the PFC.
+    drive_shift = None if shift is None else shift @ network.pfc.input.T
+    differentiable = (initial, drive_shift, sequences.seen, *network.core_parameters())
     wanted = [
         torch.is_grad_enabled() and each is not None and each.requires_grad
         for each in differentiable
@@ -67,6 +83,7 @@ class _Gradients:
     by_parameters: Tensor | None
     by_drive: Tensor | None
     by_initial: Tensor | None
+    by_shift: Tensor | None
 
 
 class _Divergence(torch.autograd.Function):
@@ -80,19 +97,11 @@ class _Divergence(torch.autograd.Function):
         chosen: Tensor,
         wanted: Sequence[bool],  # of the derivatives by what follows
         initial: Tensor | None,
+        shift: Tensor | None,
         seen: Tensor,
         *parameters: Tensor,
     ) -> Tensor:
-        by_initial, by_seen, *by_parameters = wanted
-        loss, gradients = _call(
-            network,
-            sequences,
-            chosen,
-            initial,
-            by_parameters=any(by_parameters) or by_seen or by_initial,
-            by_drive=by_seen,
-            by_initial=by_initial,
-        )
+        loss, gradients = _call(network, sequences, chosen, initial, shift, wanted)
         ctx.gradients, ctx.chosen, ctx.seen_shape = gradients, chosen, seen.shape  # type: ignore[attr-defined]
         ctx.save_for_backward(*parameters)
         return seen.new_tensor(loss)
@@ -110,12 +119,13 @@ class _Divergence(torch.autograd.Function):
         flat = cast("Tensor", gradients.by_parameters) * by_loss
         parts = torch.split(flat, [parameter.numel() for parameter in parameters])
         by_initial = None if gradients.by_initial is None else gradients.by_initial * by_loss
+        by_shift = None if gradients.by_shift is None else gradients.by_shift * by_loss
         by_seen = None
         if gradients.by_drive is not None:
             by_chosen = (gradients.by_drive * by_loss) @ parameters[0]
             by_seen = by_chosen.new_zeros(ctx.seen_shape).index_add_(0, ctx.chosen, by_chosen)
         return (
-            *(None, None, None, None, by_initial, by_seen),
+            *(None, None, None, None, by_initial, by_shift, by_seen),
             *(part.view_as(parameter) for part, parameter in zip(parts, parameters, strict=True)),
         )
 
@@ -125,23 +135,24 @@ def _call(
     sequences: Sequences,
     chosen: Tensor,
     initial: Tensor | None,
-    *,
-    by_parameters: bool,
-    by_drive: bool,
-    by_initial: bool,
+    shift: Tensor | None,
+    wanted: Sequence[bool],
 ) -> tuple[float, _Gradients]:
     seen, codes = sequences.seen.contiguous(), sequences.codes.contiguous()
     mask, entropies = sequences.mask.contiguous(), sequences.code_entropies.contiguous()
     levels = network.levels()
     units = [level.units for level in levels]
     parameters = torch.cat([each.detach().reshape(-1) for each in network.core_parameters()])
-    _check(network, sequences, chosen, initial)
+    _check(network, sequences, chosen, initial, shift)
     chosen = chosen.contiguous()
     initial = None if initial is None else initial.detach().contiguous()
+    shift = None if shift is None else shift.detach().contiguous()
+    by_initial, by_shift, by_seen, *_ = wanted
     gradients = _Gradients(
-        torch.empty_like(parameters) if by_parameters else None,
-        seen.new_empty(len(chosen), seen.shape[1], units[0]) if by_drive else None,
+        torch.empty_like(parameters) if any(wanted) else None,
+        seen.new_empty(len(chosen), seen.shape[1], units[0]) if by_seen else None,
         seen.new_empty(len(chosen), sum(units)) if by_initial else None,
+        seen.new_empty(len(chosen), units[0]) if by_shift else None,
     )
     loss = ctypes.c_double()
     c_units = (ctypes.c_int32 * len(units))(*units)
@@ -163,18 +174,26 @@ def _call(
         target_entropies=entropies.data_ptr(),
         mask=mask.data_ptr(),
         initial=_address(initial),
+        shift=_address(shift),
         parameters=parameters.data_ptr(),
         divergence=ctypes.addressof(loss),
         by_parameters=_address(gradients.by_parameters),
         by_drive=_address(gradients.by_drive),
         by_initial=_address(gradients.by_initial),
+        by_shift=_address(gradients.by_shift),
     )
     if _functions()[seen.dtype](ctypes.byref(problem)) != 0:
         raise MemoryError(f"the recurrent core has no memory for {len(chosen)} sequences")
     return loss.value, gradients
 
 
-def _check(network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor | None) -> None:
+def _check(
+    network: VMDNN,
+    sequences: Sequences,
+    chosen: Tensor,
+    initial: Tensor | None,
+    shift: Tensor | None,
+) -> None:
     """The kernel follows sizes and indices without looking."""
     count, steps = sequences.mask.shape
     expected = {
@@ -186,6 +205,8 @@ def _check(network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor
     if initial is not None:
         units = sum(level.units for level in network.levels())
         expected["initial"] = (initial, (len(chosen), units))
+    if shift is not None:
+        expected["shift, in the PFC,"] = (shift, (len(chosen), network.pfc.units))
     for name, (tensor, shape) in expected.items():
         if tensor.shape != shape or tensor.dtype != network.pfc.input.dtype:
             raise ValueError(

@@ -19,7 +19,7 @@ from learner.sequences import Sequences
 from learner.vmdnn import VMDNN
 from proto.config import NetworkConfig
 
-Loss = Callable[[VMDNN, Sequences, Tensor, Tensor | None], Tensor]
+Loss = Callable[[VMDNN, Sequences, Tensor, Tensor | None, Tensor | None], Tensor]
 DOUBLE = torch.float64
 
 
@@ -84,11 +84,14 @@ def as_type(sequences: Sequences, dtype: torch.dtype) -> Sequences:
 def loss_and_gradients(
     loss: Loss, network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor
 ) -> list[Tensor]:
-    """The loss, and its gradients by the parameters, what was seen, and the initial state."""
+    """The loss, and its gradients by the parameters, what was seen, its shift, and the state."""
     seen = sequences.seen.clone().requires_grad_()
     initial = initial.clone().requires_grad_()
-    value = loss(network, Sequences(**{**vars(sequences), "seen": seen}), chosen, initial)
-    by = [*network.core_parameters(), seen, initial]
+    generator = torch.Generator().manual_seed(3)
+    shift = torch.randn(len(chosen), seen.shape[2], generator=generator, dtype=DOUBLE)
+    shift = shift.to(seen.dtype).requires_grad_()
+    value = loss(network, Sequences(**{**vars(sequences), "seen": seen}), chosen, initial, shift)
+    by = [*network.core_parameters(), seen, initial, shift]
     gradients = torch.autograd.grad(3 * value, by, allow_unused=True, materialize_grads=True)
     return [value.detach(), *gradients]
 
