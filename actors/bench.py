@@ -35,8 +35,8 @@ from proto.machine import machine_name
 from proto.messages import Rollout
 from proto.metrics import Stage
 
-ROUNDS: Final = 5
-LIMIT_S: Final = 15.0
+ROUNDS: Final = 7
+LIMIT_S: Final = 17.0
 """No further round begins after so long."""
 
 
@@ -53,8 +53,8 @@ class ActorSpeed:
         network_numpy_ms: the same in numpy, as it acts where nothing can be compiled.
         core_ms: the part of `network_ms` that PFC, M_S, M_F and M_O take.
         steps_per_s: control steps per second of the actor's whole loop.
-        ratio: processor time of one step of the whole loop over that of the bare simulator doing
-            the same; waiting, such as for a core that others use, does not count.
+        ratio: processor time of the whole loop over that of the bare simulator doing the same;
+            waiting, such as for a core that others use, does not count.
         episode_s: time of one tutored episode.
     """
 
@@ -73,67 +73,129 @@ class ActorSpeed:
 def bench_actor(config: Config) -> ActorSpeed:
     """Measure an actor in less than half a minute.
 
-    The whole loop is an episode as the actor's process plays it: observing, the network, judging,
-    recording, and encoding what goes to the bus. In each of its steps a second simulator does the
-    same with the same scene and action, and nothing else: the bare loop. Taking turns so often,
-    both meet the same machine.
+    The whole loop is an episode as the actor's process plays it while someone watches: observing,
+    the network, judging, recording, and encoding what goes to the bus. The bare loop does the same
+    in the simulator, and nothing else. They take turns, an episode each: a loop that another
+    interrupted at every step would find its data gone from the caches.
 
     Raises:
         UserError: the simulator cannot run on this machine.
     """
     task = make_task(config.task)
     situation = task.tutored()[len(task.tutored()) // 2]
-    tutor = make_tutor(config, noisy=False)
-    checkpoint = random_checkpoint(config.network)
-    pupil = _Pupil(NetworkPolicy(checkpoint, "the benchmark"), plan(situation))
-    others = _OtherNetworks(checkpoint)
-    tutored = _Laps()
-    with (
-        closing(make_simulator(config.simulator)) as simulator,
-        closing(make_simulator(config.simulator)) as second,
-    ):
-        _play(simulator, task, tutor, situation)  # warms up
-        shadow = _Shadow(second, task, others)
+    with closing(make_simulator(config.simulator)) as simulator:
+        theatre = _Theatre(simulator, task, situation)
+        tutor = make_tutor(config, noisy=False)
+        checkpoint = _random_checkpoint(config.network)
+        pupil = _Pupil(NetworkPolicy(checkpoint, "the benchmark"), plan(situation))
+        others = _OtherNetworks(checkpoint)
+        tutored = _Laps()
+        theatre.play(tutor)  # warms up
         end = time.perf_counter() + LIMIT_S
-        while len(tutored) < ROUNDS and (not tutored or time.perf_counter() < end):
-            shadow.begin(situation)
-            _play(simulator, task, pupil, situation, shadow)
-            with tutored:
-                _play(simulator, task, tutor, situation)
-        backend = simulator.name
+        for number in range(ROUNDS):
+            if number > 0 and time.perf_counter() > end:
+                break
+            theatre.play_bare(pupil.actions)
+            theatre.play_measured(pupil)
+            if number % 2 == 0:  # the ratio needs more rounds than these
+                with tutored:
+                    theatre.play(tutor)
+                theatre.play(tutor, others.step)
     return ActorSpeed(
         machine=machine_name(),
-        backend=backend,
-        physics_ms=1e3 * median(shadow.physics) / config.simulator.substeps,
-        render_ms=1e3 * median(shadow.render),
+        backend=simulator.name,
+        physics_ms=1e3 * median(theatre.physics) / config.simulator.substeps,
+        render_ms=1e3 * median(theatre.render),
         network_ms=1e3 * median(pupil.network_laps),
         network_numpy_ms=1e3 * median(others.numpy_laps),
         core_ms=1e3 * median(others.core_laps),
-        steps_per_s=1.0 / median(shadow.whole_loop),
-        ratio=median(shadow.whole_work) / median(shadow.bare_work),
+        steps_per_s=1.0 / median(theatre.whole_time),
+        ratio=theatre.whole_work.typical() / theatre.bare_work.typical(),
         episode_s=median(tutored),
     )
 
 
 class _Laps(list[float]):
-    """How long laps took, in seconds of a clock."""
-
-    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
-        super().__init__()
-        self._clock = clock
-        self._started = math.nan
-
-    def start(self) -> None:
-        self._started = self._clock()
-
-    def stop(self) -> None:
-        self.append(self._clock() - self._started)
+    """How long laps took, in seconds."""
 
     def __enter__(self) -> None:
-        self.start()
+        self._started = time.perf_counter()
 
     def __exit__(self, *_: object) -> None:
-        self.stop()
+        self.append(time.perf_counter() - self._started)
+
+
+class _Rounds:
+    """Processor time that each control step of the same episode took, round after round."""
+
+    def __init__(self) -> None:
+        self._rounds: list[list[float]] = []
+        self._began = math.nan
+
+    def begin(self) -> None:
+        """Start a round."""
+        self._rounds.append([])
+        self._began = math.nan
+
+    def lap(self) -> None:
+        """A control step is over; the first time it only begins."""
+        self._rounds[-1].append(time.process_time() - self._began)
+        self._began = time.process_time()
+
+    def typical(self) -> float:
+        """Seconds of all steps, each its median over the rounds."""
+        return float(np.median(self._rounds, axis=0)[1:].sum())
+
+
+class _Theatre:
+    """Plays one situation in several ways, and measures them."""
+
+    def __init__(self, simulator: Simulator, task: Task, situation: Situation) -> None:
+        self.whole_time, self.render, self.physics = _Laps(), _Laps(), _Laps()
+        self.whole_work, self.bare_work = _Rounds(), _Rounds()
+        self._simulator = simulator
+        self._task = task
+        self._situation = situation
+
+    def play_bare(self, actions: NDArray[np.float64]) -> None:
+        """The simulator alone."""
+        self._simulator.reset(self._task.scene(self._situation))
+        self.bare_work.begin()
+        focus = float(self._task.start[FOCUS])
+        for action in actions:
+            with self.render:
+                self._simulator.observe(crop_of_focus(focus))
+            self.bare_work.lap()
+            with self.physics:
+                self._simulator.step(targets_of_action(action))
+            focus = float(action[FOCUS])
+
+    def play_measured(self, policy: Policy) -> None:
+        """The whole loop."""
+        self.whole_work.begin()
+        began = time.perf_counter()
+        self.play(policy, lambda _: self.whole_work.lap())
+        self.whole_time.append((time.perf_counter() - began) / len(self._task.phases))
+
+    def play(self, policy: Policy, on_image: Callable[[Image], None] | None = None) -> None:
+        """An episode as the actor's process plays it, but for the wire itself."""
+        assignment = Assignment(Kind.TRIAL, self._task, policy, self._situation, seed=0)
+
+        def on_step(live: LiveStep) -> None:
+            encode(live_message("bench", assignment, live), check=False)
+            if on_image is not None:
+                on_image(live.image)
+
+        episode = play(
+            self._simulator,
+            self._task,
+            policy,
+            self._situation,
+            seed=assignment.seed,
+            kind=assignment.kind,
+            on_step=on_step,
+        )
+        encode(Rollout(episode, "bench"))
 
 
 class _Pupil:
@@ -145,14 +207,14 @@ class _Pupil:
     target: NDArray[np.float64] | None = None
 
     def __init__(self, network: NetworkPolicy, actions: NDArray[np.float64]) -> None:
+        self.actions = actions
         self.outputs: Floats | None = None
         self.network_laps = _Laps()
         self._network = network
-        self._actions = actions
 
     def begin(self, situation: Situation, seed: int) -> None:
         self._network.begin(situation, seed)
-        self._next = iter(self._actions)
+        self._next = iter(self.actions)
 
     def step(self, image: Image) -> NDArray[np.float64]:
         with self.network_laps:
@@ -179,7 +241,7 @@ class _OtherNetworks:
             self._parts.act(seen)
 
 
-def random_checkpoint(config: NetworkConfig) -> Checkpoint:
+def _random_checkpoint(config: NetworkConfig) -> Checkpoint:
     """A network of the configured sizes that has learned nothing."""
     rng = np.random.default_rng(0)
     tensors = {
@@ -200,57 +262,3 @@ def random_checkpoint(config: NetworkConfig) -> Checkpoint:
         ),
     )
     return Checkpoint(metadata, tensors)
-
-
-class _Shadow:
-    """Does in a simulator of its own what another is told, step by step, and measures both."""
-
-    def __init__(self, simulator: Simulator, task: Task, networks: _OtherNetworks) -> None:
-        self.whole_loop, self.render, self.physics = _Laps(), _Laps(), _Laps()
-        self.whole_work, self.bare_work = _Laps(time.process_time), _Laps(time.process_time)
-        self._simulator = simulator
-        self._task = task
-        self._networks = networks
-
-    def begin(self, situation: Situation) -> None:
-        """Start an episode."""
-        self._simulator.reset(self._task.scene(situation))
-        self._focus = float(self._task.start[FOCUS])
-        self._first = True
-
-    def follow(self, live: LiveStep) -> None:
-        """Observe and run one control step; between two calls the other loop goes round once."""
-        if not self._first:
-            self.whole_loop.stop()
-            self.whole_work.stop()
-        with self.bare_work:
-            with self.render:
-                self._simulator.observe(crop_of_focus(self._focus))
-            with self.physics:
-                self._simulator.step(targets_of_action(live.action))
-        self._networks.step(live.image)
-        self._focus = float(live.action[FOCUS])
-        self._first = False
-        self.whole_loop.start()
-        self.whole_work.start()
-
-
-def _play(
-    simulator: Simulator,
-    task: Task,
-    policy: Policy,
-    situation: Situation,
-    shadow: _Shadow | None = None,
-) -> None:
-    """An episode as the actor's process plays it, but for the wire itself."""
-    assignment = Assignment(Kind.TRIAL, task, policy, situation, seed=0)
-
-    def on_step(live: LiveStep) -> None:
-        encode(live_message("bench", assignment, live), check=False)
-        if shadow is not None:
-            shadow.follow(live)
-
-    episode = play(
-        simulator, task, policy, situation, seed=0, kind=assignment.kind, on_step=on_step
-    )
-    encode(Rollout(episode, "bench"))
