@@ -7,7 +7,6 @@ sequence is computed once, when the sequence comes in.
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -72,21 +71,18 @@ class CoupledTraining:
         if self._sequences is None:
             self._sequences = Sequences.stacked(self._seen, self._codes)
             self._spread = self._sequences.seen.std((0, 1))
-        if self._vision_noise == 0:
-            return divergence(self._network, self._sequences, chosen)
-        disturbed = self._disturbed(self._sequences.chosen(chosen))
-        return divergence(self._network, disturbed, torch.arange(len(chosen)))
+        return divergence(self._network, self._sequences, chosen, shift=self._wrongly(len(chosen)))
 
-    def _disturbed(self, sequences: Sequences) -> Sequences:
-        """Sequences each seen a little wrongly, in one way from its start to its end.
+    def _wrongly(self, count: int) -> Tensor | None:
+        """How wrongly V_S sees some sequences, each in one way from its start to its end.
 
         Between the tutored situations the network so sees what it has learned to act on, and
         interpolates instead of snapping to the nearest of them.
         """
-        shape = (len(sequences.seen), 1, len(self._spread))
-        wrong = torch.randn(shape, generator=self._generator)
-        seen = sequences.seen + self._vision_noise * self._spread * wrong
-        return replace(sequences, seen=seen)
+        if self._vision_noise == 0:
+            return None
+        wrong = torch.randn(count, len(self._spread), generator=self._generator)
+        return self._vision_noise * self._spread * wrong
 
     def mean_errors(self) -> NDArray[np.float64]:
         """(11,) mean distance of the decoded outputs from the targets, over all sequences."""

@@ -43,9 +43,3 @@ class Sequences:
     def to(self, device: torch.device) -> Self:
         """The same on another device."""
         return type(self)(*(tensor.to(device) for tensor in vars(self).values()))
-
-    def chosen(self, indices: Tensor) -> Self:
-        """The sequences with these indices (B,)."""
-        return type(self)(
-            *(values[indices] for values in (self.seen, self.codes, self.mask, self.code_entropies))
-        )
