@@ -22,6 +22,7 @@ from learner.divergence import divergence, reference_divergence
 from learner.kernels.library import peak_flops
 from learner.loss import kl_divergence
 from learner.mstnn import activation
+from learner.optimization import one_thread
 from learner.plain import Step, plain_divergence, plain_outputs, plain_step
 from learner.sequences import Sequences
 from learner.vmdnn import VMDNN
@@ -187,7 +188,8 @@ def _epoch(
         adam.zero_grad()
         value = loss(chosen)
         value.backward()  # type: ignore[no-untyped-call]
-        adam.step()
+        with one_thread():
+            adam.step()
         return value
 
     updates = CapturedUpdates(update) if captured else update

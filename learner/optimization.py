@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final, Literal, Protocol
 
@@ -115,5 +116,21 @@ class Optimization:
                 f"the training diverged (loss {value}): lower learner.rate or learner.clip_norm,"
                 " and go on from the last checkpoint or start again"
             )
-        self._adam.step()
+        with one_thread():
+            self._adam.step()
         return value
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let PyTorch compute in one thread.
+
+    A step of Adam on so few weights takes less time than threads take to meet; where others use the
+    cores too, it is a thousand times as long.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
