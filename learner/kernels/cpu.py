@@ -101,7 +101,7 @@ class _Divergence(torch.autograd.Function):
         seen: Tensor,
         *parameters: Tensor,
     ) -> Tensor:
-        loss, gradients = _call(network, sequences, chosen, initial, shift, wanted)
+        loss, gradients = _call(network, sequences, chosen, initial, shift, parameters, wanted)
         ctx.gradients, ctx.chosen, ctx.seen_shape = gradients, chosen, seen.shape  # type: ignore[attr-defined]
         ctx.save_for_backward(*parameters)
         return seen.new_tensor(loss)
@@ -136,20 +136,21 @@ def _call(
     chosen: Tensor,
     initial: Tensor | None,
     shift: Tensor | None,
+    parameters: Sequence[Tensor],
     wanted: Sequence[bool],
 ) -> tuple[float, _Gradients]:
     seen, codes = sequences.seen.contiguous(), sequences.codes.contiguous()
     mask, entropies = sequences.mask.contiguous(), sequences.code_entropies.contiguous()
     levels = network.levels()
     units = [level.units for level in levels]
-    parameters = torch.cat([each.detach().reshape(-1) for each in network.core_parameters()])
+    flat = torch.cat([each.reshape(-1) for each in parameters])
     _check(network, sequences, chosen, initial, shift)
     chosen = chosen.contiguous()
-    initial = None if initial is None else initial.detach().contiguous()
-    shift = None if shift is None else shift.detach().contiguous()
+    initial = None if initial is None else initial.contiguous()
+    shift = None if shift is None else shift.contiguous()
     by_initial, by_shift, by_seen, *_ = wanted
     gradients = _Gradients(
-        torch.empty_like(parameters) if any(wanted) else None,
+        torch.empty_like(flat) if any(wanted) else None,
         seen.new_empty(len(chosen), seen.shape[1], units[0]) if by_seen else None,
         seen.new_empty(len(chosen), sum(units)) if by_initial else None,
         seen.new_empty(len(chosen), units[0]) if by_shift else None,
@@ -175,7 +176,7 @@ def _call(
         mask=mask.data_ptr(),
         initial=_address(initial),
         shift=_address(shift),
-        parameters=parameters.data_ptr(),
+        parameters=flat.data_ptr(),
         divergence=ctypes.addressof(loss),
         by_parameters=_address(gradients.by_parameters),
         by_drive=_address(gradients.by_drive),
@@ -196,8 +197,9 @@ def _check(
 ) -> None:
     """The kernel follows sizes and indices without looking."""
     count, steps = sequences.mask.shape
+    like = network.pfc.input
     expected = {
-        "seen": (sequences.seen, (count, steps, network.pfc.input.shape[1])),
+        "seen": (sequences.seen, (count, steps, like.shape[1])),
         "codes": (sequences.codes, (count, steps, *network.outputs.shape)),
         "mask": (sequences.mask, (count, steps)),
         "code_entropies": (sequences.code_entropies, (count, steps)),
@@ -208,10 +210,10 @@ def _check(
     if shift is not None:
         expected["shift, in the PFC,"] = (shift, (len(chosen), network.pfc.units))
     for name, (tensor, shape) in expected.items():
-        if tensor.shape != shape or tensor.dtype != network.pfc.input.dtype:
+        if tensor.shape != shape or tensor.dtype != like.dtype:
             raise ValueError(
                 f"{name} is {tuple(tensor.shape)} {tensor.dtype}, but the network needs"
-                f" {tuple(shape)} {network.pfc.input.dtype}"
+                f" {tuple(shape)} {like.dtype}"
             )
     if chosen.dtype != torch.int64 or len(chosen) == 0:
         raise ValueError(f"chosen is {len(chosen)} {chosen.dtype}, but must be some int64")
