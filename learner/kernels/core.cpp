@@ -270,6 +270,9 @@ class Pass {
   void take_memory(Arena& arena);
   void pack_weights();
   void pack_connection(Connection<Real>& connection, int to, int to_padded, const Level& from);
+  static int urgency(const Group& group) {
+    return group.stage == kForward || group.stage == kBackward ? kDone : -group.stage;
+  }
   void work(const Scratch& scratch);
   bool claim(Task& task);
   void finish(const Task& task);
@@ -494,21 +497,27 @@ void Pass<Real>::work(const Scratch& scratch) {
   }
 }
 
-// The next piece of work, or false when all is done. The first group that can go on does, so that
-// the groups' scans, which only one thread can do, begin early.
+// The next piece of work, or false when all is done. Only one thread at a time can scan a group, so
+// that scans come first and the groups keep about level: else the last one would be scanned alone.
+// Not too many are begun, for the cache's sake.
 template <typename Real>
 bool Pass<Real>::claim(Task& task) {
+  const int most_begun = problem_.threads == 1 ? 1 : problem_.threads + 1;
   for (bool done = false; !done; std::this_thread::yield()) {
     const std::lock_guard<std::mutex> lock(mutex_);
-    done = true;
+    int begun = 0;
+    Group* best = nullptr;
     for (Group& group : groups_) {
       if (group.stage == kDone) continue;
-      done = false;
-      if (group.next < chunks(group, group.stage)) {
-        task = {&group, group.stage, group.next++};
-        return true;
-      }
+      if (++begun > most_begun) break;
+      const bool ready = group.next < chunks(group, group.stage);
+      if (ready && (best == nullptr || urgency(group) > urgency(*best))) best = &group;
     }
+    if (best != nullptr) {
+      task = {best, best->stage, best->next++};
+      return true;
+    }
+    done = begun == 0;
   }
   return false;
 }

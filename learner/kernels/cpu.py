@@ -65,7 +65,8 @@ def divergence(
     """`learner.divergence.divergence`, computed by the kernel."""
     # The kernel reads what was seen where it lies; that all of it is shifted it learns in the PFC.
     drive_shift = None if shift is None else shift @ network.pfc.input.T
-    differentiable = (initial, drive_shift, sequences.seen, *network.core_parameters())
+    parameters = torch.cat([each.view(-1) for each in network.core_parameters()])
+    differentiable = (initial, drive_shift, sequences.seen, parameters)
     wanted = [
         torch.is_grad_enabled() and each is not None and each.requires_grad
         for each in differentiable
@@ -99,11 +100,11 @@ class _Divergence(torch.autograd.Function):
         initial: Tensor | None,
         shift: Tensor | None,
         seen: Tensor,
-        *parameters: Tensor,
+        parameters: Tensor,
     ) -> Tensor:
         loss, gradients = _call(network, sequences, chosen, initial, shift, parameters, wanted)
         ctx.gradients, ctx.chosen, ctx.seen_shape = gradients, chosen, seen.shape  # type: ignore[attr-defined]
-        ctx.save_for_backward(*parameters)
+        ctx.save_for_backward(parameters)
         return seen.new_tensor(loss)
 
     @staticmethod
@@ -115,19 +116,20 @@ class _Divergence(torch.autograd.Function):
             )
         (by_loss,) = by_outputs
         gradients: _Gradients = ctx.gradients
-        parameters = ctx.saved_tensors
-        flat = cast("Tensor", gradients.by_parameters) * by_loss
-        parts = torch.split(flat, [parameter.numel() for parameter in parameters])
-        by_initial = None if gradients.by_initial is None else gradients.by_initial * by_loss
-        by_shift = None if gradients.by_shift is None else gradients.by_shift * by_loss
         by_seen = None
         if gradients.by_drive is not None:
-            by_chosen = (gradients.by_drive * by_loss) @ parameters[0]
+            (parameters,) = ctx.saved_tensors
+            units, inputs = gradients.by_drive.shape[2], ctx.seen_shape[2]
+            by_chosen = (gradients.by_drive * by_loss) @ parameters[: units * inputs].view(
+                units, -1
+            )
             by_seen = by_chosen.new_zeros(ctx.seen_shape).index_add_(0, ctx.chosen, by_chosen)
-        return (
-            *(None, None, None, None, by_initial, by_shift, by_seen),
-            *(part.view_as(parameter) for part, parameter in zip(parts, parameters, strict=True)),
+        by_others = (
+            None if each is None else each * by_loss
+            for each in (gradients.by_initial, gradients.by_shift, gradients.by_parameters)
         )
+        by_initial, by_shift, by_parameters = by_others
+        return (None, None, None, None, by_initial, by_shift, by_seen, by_parameters)
 
 
 def _call(
@@ -136,21 +138,20 @@ def _call(
     chosen: Tensor,
     initial: Tensor | None,
     shift: Tensor | None,
-    parameters: Sequence[Tensor],
+    parameters: Tensor,
     wanted: Sequence[bool],
 ) -> tuple[float, _Gradients]:
     seen, codes = sequences.seen.contiguous(), sequences.codes.contiguous()
     mask, entropies = sequences.mask.contiguous(), sequences.code_entropies.contiguous()
     levels = network.levels()
     units = [level.units for level in levels]
-    flat = torch.cat([each.reshape(-1) for each in parameters])
     _check(network, sequences, chosen, initial, shift)
     chosen = chosen.contiguous()
     initial = None if initial is None else initial.contiguous()
     shift = None if shift is None else shift.contiguous()
     by_initial, by_shift, by_seen, *_ = wanted
     gradients = _Gradients(
-        torch.empty_like(flat) if any(wanted) else None,
+        torch.empty_like(parameters) if any(wanted) else None,
         seen.new_empty(len(chosen), seen.shape[1], units[0]) if by_seen else None,
         seen.new_empty(len(chosen), sum(units)) if by_initial else None,
         seen.new_empty(len(chosen), units[0]) if by_shift else None,
@@ -176,7 +177,7 @@ def _call(
         mask=mask.data_ptr(),
         initial=_address(initial),
         shift=_address(shift),
-        parameters=flat.data_ptr(),
+        parameters=parameters.data_ptr(),
         divergence=ctypes.addressof(loss),
         by_parameters=_address(gradients.by_parameters),
         by_drive=_address(gradients.by_drive),
