@@ -233,7 +233,7 @@ def test_a_killed_learner_publishes_its_policy_again_and_goes_on(school: School)
 
 
 def test_it_obeys_and_a_clean_stop_loses_no_epoch(school: School) -> None:
-    school.start()
+    school.start("--set", "learner.epochs=1000000", "--set", "learner.publish_every_epochs=1000")
     school.show_all()
     school.tells(lambda told: told.stage is Stage.COUPLED and told.epoch > 0)
 

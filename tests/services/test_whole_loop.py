@@ -112,6 +112,9 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
 
         eventually(done, "the run is done", patience_s=150.0)
         evaluated = told["evaluator"]
+        # what was tried twice because a lease died with its holder may still be on its way
+        outboxes = loop.folder / "outbox"
+        eventually(lambda: not list(outboxes.glob("*/*/*")), "every receipt has come")
         assert loop.stop_all() == [0] * 6
 
     assert isinstance(evaluated, EvaluatorMetrics)
@@ -139,4 +142,3 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
     )
     recorded = {path.stem for path in (loop.folder / "rollouts").glob("*.mcap")}
     assert {trial["episode"] for trial in counted} <= recorded
-    assert list((loop.folder / "outbox").glob("*/*/*")) == []
