@@ -1,7 +1,7 @@
 """The subnets of VMDNN (paper, section 4.1): their sizes and parameters follow from the config.
 
 This is the only place where sizes are computed. The network that learns (`learner.vmdnn`, torch),
-the network that acts (`learner.stepping`, numpy) and `vmdnn inspect network` are built from it.
+the network that acts (`learner.stepping`) and `vmdnn inspect network` are built from it.
 """
 
 from __future__ import annotations

@@ -236,6 +236,13 @@ def test_the_sender_hears_of_its_own_mistake(sequence: Sequence) -> None:
         encode(Sequence(wrong))
 
 
+def test_without_its_check_a_mistake_is_refused_by_the_reader(sequence: Sequence) -> None:
+    assert encode(sequence, check=False) == encode(sequence)
+    wrong = replace(sequence, episode=replace(sequence.episode, seed=-1))
+    with pytest.raises(MessageError, match=r"episode\.seed"):
+        decode(encode(wrong, check=False), Sequence)
+
+
 def test_another_message_or_version_is_refused(sequence: Sequence) -> None:
     wire = encode(sequence)
     assert wire.encoding == "application/msgpack;vmdnn.sequence.1"
