@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
 
 from proto.errors import UserError
 from proto.files import written_whole
@@ -304,11 +305,16 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     except ValidationError as error:
         where = f"config file {path}" if path else "config"
         problems = "\n".join(
-            f"  {'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"
-            f" (got {problem['input']!r})"
+            f"  {'.'.join(str(part) for part in problem['loc'])}: {_what_is_wrong(problem)}"
             for problem in error.errors()
         )
         raise UserError(f"{where} is not valid:\n{problems}") from error
+
+
+def _what_is_wrong(problem: ErrorDetails) -> str:
+    if problem["type"] == "extra_forbidden":
+        return "there is no such key; proto/config.py lists those there are"
+    return f"{problem['msg']} (got {problem['input']!r})"
 
 
 def _apply(values: dict[str, Any], override: str) -> None:
