@@ -46,7 +46,6 @@ LOOSE_POSITION: Final = 0.01
 ANGLE: Final = np.deg2rad(1.0)
 CLEARANCE: Final = 0.002
 LIMIT: Final = np.deg2rad(0.5)
-TURN: Final = np.deg2rad(8.0)
 
 OBJECT_MARGIN_M: Final = 0.006
 TABLE_MARGIN_M: Final = 0.004
@@ -55,6 +54,8 @@ PASSING_MARGIN_M: Final = 0.016
 DESCENT_M: Final = 0.085
 LIFT_M: Final = 0.11
 STEEPEST_APPROACH_RAD: Final = np.deg2rad(40.0)
+NEAREST_OBSTACLE: Final[Situation] = {"obstacle_x_m": -0.22}
+"""What is done at the object keeps clear of the obstacle wherever it stands."""
 
 
 def fit_polynomial(
@@ -173,14 +174,12 @@ class PostureFitter:
         start = np.zeros((len(OBJECT_ORDERS), 7))
         start[0] = np.deg2rad([-5.0, 25.0, 45.0, 70.0, -35.0, -45.0, 8.0])
         centre = start[0].copy()
-        nearest = {"obstacle_x_m": -0.22}
 
         def residual(posture: Array, i: int) -> Array:
             situation = self._objects[i]
             pose = self._arm.pose(posture)
             box = _object_box(situation)
-            across = np.array([np.cos(box.yaw_rad), np.sin(box.yaw_rad), 0.0])
-            along = np.array([-across[1], across[0], 0.0])
+            across, along = box.level_axes()
             offset = pose.rotation @ GRASP_CENTRE_M + pose.position_m - box.centre_m
             axis = pose.rotation @ GRASP_AXIS
             down = -(pose.rotation @ APPROACH_AXIS)[2]
@@ -192,7 +191,7 @@ class PostureFitter:
                     [max(0.0, np.cos(STEEPEST_APPROACH_RAD) - down) / (4 * ANGLE)],
                     _short(self._distances(pose, box), OBJECT_MARGIN_M),
                     self._table(pose),
-                    self._obstacle(pose, nearest, OBSTACLE_MARGIN_M),
+                    self._obstacle(pose, NEAREST_OBSTACLE, OBSTACLE_MARGIN_M),
                     self._limits(posture),
                     (posture - centre) / (60 * ANGLE),
                 ]
@@ -202,7 +201,6 @@ class PostureFitter:
 
     def _fit_descent(self, grasp: Array, below: Array, height_m: float) -> Array:
         """The open hand, raised straight above its grasp, turned the same way."""
-        nearest = {"obstacle_x_m": -0.22}
         grasps = [self._arm.pose(q) for q in self._object_features @ grasp]
         before = self._object_features @ below
         loose = 1.0 + 4.0 * height_m / DESCENT_M
@@ -210,8 +208,7 @@ class PostureFitter:
         def residual(posture: Array, i: int) -> Array:
             pose = self._arm.pose(posture)
             box = _object_box(self._objects[i])
-            across = np.array([np.cos(box.yaw_rad), np.sin(box.yaw_rad), 0.0])
-            along = np.array([-across[1], across[0], 0.0])
+            across, along = box.level_axes()
             target = box.centre_m + np.array([0.0, 0.0, height_m])
             offset = pose.rotation @ GRASP_CENTRE_M + pose.position_m - target
             axis = pose.rotation @ GRASP_AXIS
@@ -224,7 +221,7 @@ class PostureFitter:
                     turned / (3 * ANGLE * loose),
                     _short(self._distances(pose, box), OBJECT_MARGIN_M),
                     self._table(pose),
-                    self._obstacle(pose, nearest, OBSTACLE_MARGIN_M),
+                    self._obstacle(pose, NEAREST_OBSTACLE, OBSTACLE_MARGIN_M),
                     self._limits(posture),
                     (posture - before[i]) / (15 * ANGLE),
                 ]
@@ -234,7 +231,6 @@ class PostureFitter:
 
     def _fit_lift(self, grasp: Array, below: Array, height_m: float) -> Array:
         """The grasped object raised, held level enough, free to drift sideways a little."""
-        nearest = {"obstacle_x_m": -0.22}
         grasps = [self._arm.pose(q) for q in self._object_features @ grasp]
         before = self._object_features @ below
 
@@ -248,7 +244,7 @@ class PostureFitter:
                     offset / [3 * LOOSE_POSITION, 3 * LOOSE_POSITION, 3 * POSITION],
                     ((pose.rotation - grasps[i].rotation) / (10 * ANGLE)).ravel(),
                     self._table(pose),
-                    self._obstacle(pose, nearest, 2 * OBSTACLE_MARGIN_M),
+                    self._obstacle(pose, NEAREST_OBSTACLE, 2 * OBSTACLE_MARGIN_M),
                     self._limits(posture),
                     (posture - before[i]) / (10 * ANGLE),
                 ]

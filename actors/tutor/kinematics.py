@@ -42,6 +42,11 @@ class Cuboid:
     size_m: Array
     yaw_rad: float = 0.0
 
+    def level_axes(self) -> tuple[Array, Array]:
+        """Unit vectors (3,), (3,) along its x and y, in the world frame."""
+        c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
+        return np.array([c, s, 0.0]), np.array([-s, c, 0.0])
+
     def distance(self, points: Array) -> Array:
         """Signed distances (N,) of points (N, 3) from the surface; negative inside (m)."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)

@@ -45,18 +45,12 @@ def plan(situation: Situation) -> Array:
     steps = dict(zip(SUBTASKS, np.cumsum([0, *SUBTASKS.values()]), strict=False))
     total = sum(SUBTASKS.values())
     actions = np.tile(START, (total, 1))
-    actions[:, ARM] = _arm(situation, load())
+    actions[:, ARM] = _arm(situation, load_key_postures())
     actions[:, NECK] = _neck(situation, steps)
     closing = _ramp(total, steps["grasp"], CLOSING_STEPS)
     actions[:, GRASP] = 1.0 + 9.0 * closing
     actions[:, FOCUS] = 1.0 + 19.0 * _ramp(total, steps["descend"], FOCUS_STEPS)
     return clip_action(actions)  # between key postures a joint may pass its limit by a degree
-
-
-@cache
-def load() -> KeyPostures:
-    """The fitted key postures, read once."""
-    return load_key_postures()
 
 
 @cache

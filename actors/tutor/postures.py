@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.resources import files
 from typing import Final
 
@@ -85,8 +86,9 @@ def travel(postures: Sequence[Array], share: Array | float) -> Array:
 FITTED: Final = files("actors.tutor").joinpath("experiment1.json")
 
 
+@cache
 def load_key_postures() -> KeyPostures:
-    """The postures that were fitted once and lie beside this module."""
+    """The postures that were fitted once and lie beside this module; read once."""
     values = json.loads(FITTED.read_text())
     return KeyPostures(
         start=np.array(values["start"]),
