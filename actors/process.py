@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from actors.guided import GuidedPolicy
 from actors.player import LiveStep, play
 from actors.policies import make_tutor
 from actors.policy import Policy
@@ -24,6 +25,7 @@ from proto.config import Config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.messages import (
+    Correction,
     Live,
     PolicyVersion,
     Receipt,
@@ -38,6 +40,7 @@ from proto.metrics import ActorMetrics
 from proto.outbox import Outbox
 from proto.pace import Pace
 from proto.process import Lifecycle, every, membership
+from proto.seeds import PRACTICE
 
 LOG = logging.getLogger(__name__)
 
@@ -101,7 +104,7 @@ class ActorProcess:
         self._lifecycle = lifecycle
         self._digest = config.digest()
         self._task = make_task(config.task)
-        self._tutored = {name: make() for name, make in TASKS.items()}
+        self._tasks = {name: make() for name, make in TASKS.items()}
         self._simulator = make_simulator(config.simulator)
         outbox = config.run_folder / "outbox" / bus.id
         self._sequences = Outbox(outbox / "sequences", bus.deliver_wire)
@@ -172,18 +175,46 @@ class ActorProcess:
         self._send(episode)
 
     def _tutoring(self) -> Assignment | None:
-        """A case that the learner wants to be shown."""
+        """A case that the learner wants to be shown, or a situation to be guided in."""
         if len(self._sequences) >= OUTBOX_LIMIT:
             return None
-        request = TutoringRequest(self._bus.id)
-        for answer in self._bus.ask(self._bus.keys.request_tutoring, request, TutoringCase):
-            task = self._tutored.get(answer.task)
-            if task is None or answer.case >= len(task.tutored()):
-                LOG.warning("the learner asks for %s, which there is not", answer)
-                continue
-            policy, case = make_tutor(self._config, noisy=answer.repeat > 0), answer.case
-            return Assignment(Kind.TUTORING, task, policy, task.tutored()[case], answer.seed)
+        version = self._policy.version if self._policy else 0
+        request = TutoringRequest(self._bus.id, self._policy_run, version)
+        key = self._bus.keys.request_tutoring
+        answers: list[TutoringCase | Correction]
+        answers = self._bus.ask(key, request, TutoringCase, Correction)
+        for answer in answers:
+            try:
+                if isinstance(answer, Correction):
+                    return self._guidance(answer)
+                return self._demonstration(answer)
+            except UserError as error:
+                LOG.warning("what the learner asks for is not played: %s", error)
         return None
+
+    def _demonstration(self, asked: TutoringCase) -> Assignment:
+        """Show a tutored case; UserError if there is none such."""
+        task = self._task_called(asked.task)
+        situations = task.tutored()
+        if asked.case >= len(situations):
+            raise UserError(f"{asked.task} has no tutored case {asked.case}")
+        tutor = make_tutor(self._config, noisy=asked.repeat > 0)
+        return Assignment(Kind.TUTORING, task, tutor, situations[asked.case], asked.seed)
+
+    def _guidance(self, asked: Correction) -> Assignment:
+        """Guide the policy at hand; UserError if the situation cannot be."""
+        task = self._task_called(asked.task)
+        task.check(asked.situation)
+        if self._policy is None:
+            raise UserError("there is no policy to be guided")
+        tutor = make_tutor(self._config, noisy=False)
+        guided = GuidedPolicy(self._policy, tutor, self._config.tutor.guidance_deg)
+        return Assignment(Kind.CORRECTION, task, guided, asked.situation, asked.seed)
+
+    def _task_called(self, name: str) -> Task:
+        if name not in self._tasks:
+            raise UserError(f"no task is called {name!r}")
+        return self._tasks[name]
 
     def _trial(self) -> Assignment | None:
         """A trial of the policy at hand that the evaluator wants."""
@@ -201,7 +232,7 @@ class ActorProcess:
             return None
         if len(self._rollouts) >= PRACTICE_LIMIT:
             return None
-        seed = secrets.randbits(31)
+        seed = secrets.choice(PRACTICE)
         situation = self._task.sample(seed)
         return Assignment(Kind.PRACTICE, self._task, self._policy, situation, seed)
 
@@ -231,7 +262,7 @@ class ActorProcess:
     def _send(self, episode: Episode) -> None:
         keys, actor = self._bus.keys, self._bus.id
         try:
-            if episode.kind is Kind.TUTORING:
+            if episode.kind in (Kind.TUTORING, Kind.CORRECTION):
                 self._sequences.add(episode.id, keys.sequence(actor), encode(Sequence(episode)))
             else:
                 rollout = Rollout(episode, self._policy_run)

@@ -70,6 +70,8 @@ class CheckpointMetadata(_Model):
         config_digest: digest of the effective configuration.
         network: the network.
         code: ranges of the outputs; None as long as the network cannot act.
+        cases: different situations that this stage has learned from; 0 if that was not counted.
+        sequences: sequences that it has learned from; 0 if that was not counted.
         training: None in a policy.
     """
 
@@ -82,6 +84,8 @@ class CheckpointMetadata(_Model):
     config_digest: str
     network: NetworkConfig
     code: CodeRanges | None
+    cases: int = 0
+    sequences: int = 0
     training: TrainingMetadata | None = None
 
     def softmax_code(self) -> SoftmaxCode | None:

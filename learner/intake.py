@@ -19,6 +19,7 @@ class Intake:
 
     Attributes:
         taken: ids of the sequences handed out, in that order.
+        situations: the situations that they show, each once.
         refused: why the others of the store cannot be learned from, by id.
     """
 
@@ -36,6 +37,7 @@ class Intake:
         self._image = image
         self._values = tuple(values)
         self.taken: list[str] = []
+        self.situations: set[frozenset[tuple[str, float]]] = set()
         self.refused: dict[str, str] = {}
 
     def new(self) -> list[Episode]:
@@ -79,11 +81,12 @@ class Intake:
                 continue
             episodes.append(episode)
             self.taken.append(sequence)
+            self.situations.add(frozenset(episode.situation.items()))
         return episodes
 
     def _check(self, episode: Episode) -> None:
         width, height = self._image
-        if episode.kind is not Kind.TUTORING:
+        if episode.kind not in (Kind.TUTORING, Kind.CORRECTION):
             raise UserError(f"{episode.id} is a {episode.kind} episode, not a tutored one")
         if episode.steps == 0 or episode.images.shape[1:] != (height, width):
             raise UserError(

@@ -14,17 +14,25 @@ from proto.metrics import Stage
 
 
 def open_training(
-    config: Config, folder: Path, store: TutoringStore, pretraining_store: TutoringStore | None
+    config: Config,
+    folder: Path,
+    store: TutoringStore,
+    pretraining_store: TutoringStore | None,
+    *,
+    rounds: int = 0,
 ) -> Trainer:
     """Go on with the training of a run's folder, or start it where there is none.
+
+    Without actors there are no corrections, so there are no rounds of them unless they are asked
+    for, whatever the configuration says.
 
     Raises:
         UserError: the folder has a training of another network, or a damaged one.
     """
     path = training_file(folder)
     if path.exists():
-        return Trainer.restore(path, config, store, pretraining_store)
-    return Trainer(config, store, pretraining_store)
+        return Trainer.restore(path, config, store, pretraining_store, rounds=rounds)
+    return Trainer(config, store, pretraining_store, rounds=rounds)
 
 
 def run_training(
@@ -59,9 +67,14 @@ def pretraining_is_over(trainer: Trainer) -> bool:
 
 
 def policy_is_due(trainer: Trainer, config: LearnerConfig) -> bool:
-    """Whether the epoch that was just done gives a policy: every so many, and the last one."""
-    coupled = trainer.stage is Stage.COUPLED and trainer.epochs_done > 0
-    return trainer.finished or (coupled and trainer.epochs_done % config.publish_every_epochs == 0)
+    """Whether the epoch that was just done gives a policy.
+
+    In the first lap every so many epochs do, and in all laps the last one.
+    """
+    if trainer.finished or trainer.round_begins:
+        return True
+    first_lap = trainer.stage is Stage.COUPLED and trainer.round == 0
+    return first_lap and trainer.epochs_done % config.publish_every_epochs == 0
 
 
 def write_policy(trainer: Trainer, folder: Path) -> None:

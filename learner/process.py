@@ -12,14 +12,24 @@ from pathlib import Path
 from typing import Final
 
 from learner.checkpoint import load_checkpoint, policy_file, pretraining_file, training_file
+from learner.corrections import Round, Situations
 from learner.curriculum import Curriculum
 from learner.offline import open_training, policy_is_due, pretraining_is_over, write_policy
 from learner.store import TutoringStore
 from proto.bus import Bus, Inbox
 from proto.config import Config
+from proto.episode import Episode
 from proto.files import written_whole
 from proto.keys import Role
-from proto.messages import PolicyVersion, Receipt, Sequence, TutoringCase, TutoringRequest
+from proto.messages import (
+    Correction,
+    PolicyVersion,
+    Receipt,
+    Sequence,
+    TutoringCase,
+    TutoringRequest,
+    Verdict,
+)
 from proto.metrics import LearnerMetrics, Stage
 from proto.pace import Pace
 from proto.process import Lifecycle, alone_in_run, membership
@@ -56,7 +66,7 @@ class LearnerProcess:
     """
 
     def __init__(
-        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, tutored_cases: Mapping[str, int]
+        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, tasks: Mapping[str, Situations]
     ) -> None:
         """Restore what is in the run's folder.
 
@@ -64,7 +74,7 @@ class LearnerProcess:
             config: the configuration of the run.
             bus: connection to the others.
             lifecycle: when to pause and to stop.
-            tutored_cases: number of tutored cases that each task has, by name.
+            tasks: the situations of each task, by name.
 
         Raises:
             UserError: the folder holds a training that cannot go on, or the configuration asks for
@@ -74,19 +84,24 @@ class LearnerProcess:
         self._bus = bus
         self._lifecycle = lifecycle
         self._folder = config.run_folder
+        tutored_cases = {name: len(task.tutored()) for name, task in tasks.items()}
         self._curriculum = Curriculum(config, tutored_cases)
+        self._situations = tasks[config.task.name]
         self._stores = _stores(config)
-        for store in self._stores.values():
-            self._curriculum.shown(filter(None, map(store.load, store.ids)))
         self._materials = self._make_materials()
         self._trainer = open_training(
             config,
             self._folder,
             self._materials[Stage.COUPLED].store,
             self._materials[Stage.PRETRAINING].store,
+            rounds=config.learner.corrections.rounds,
         )
         self._training = threading.Lock()  # held while the trainer changes or is written to disk
         self._run_id = _run_id(self._folder)
+        self._round = self._make_round()
+        for store in self._stores.values():
+            for episode in filter(None, map(store.load, store.ids)):
+                self._note(episode)
         self._pace = Pace()
 
     def run(self) -> None:
@@ -109,7 +124,7 @@ class LearnerProcess:
 
     def metrics(self) -> LearnerMetrics:
         """What it tells about itself."""
-        done = self._config.done
+        done, awaited = self._config.done, self._round
         return LearnerMetrics(
             id=self._bus.id,
             time_s=time.time(),
@@ -119,6 +134,9 @@ class LearnerProcess:
             epochs_total=self._trainer.epochs_total,
             loss=self._trainer.loss,
             sequences=self._sequences,
+            round=self._trainer.round,
+            corrections=awaited.kept if awaited else 0,
+            corrections_total=awaited.most if awaited else 0,
             epochs_per_s=self._pace.per_second(),
             policy_version=self._trainer.version,
             paused=self._lifecycle.paused,
@@ -140,6 +158,8 @@ class LearnerProcess:
     def _stage(self) -> Stage:
         material = self._materials.get(self._trainer.next_stage)
         waiting = material is not None and not material.enough
+        if self._round is not None:
+            waiting = not self._round.complete
         return Stage.WAITING if waiting else self._trainer.stage
 
     @property
@@ -161,28 +181,71 @@ class LearnerProcess:
         """From now on sequences are received and cases handed out."""
         keys = self._bus.keys
         self._bus.answer(keys.request_tutoring, TutoringRequest, self._hand_out)
+        self._bus.subscribe(keys.verdict, self._on_verdict, Verdict)
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
         return self._bus.inbox(keys.sequence(), Sequence, capacity=WAITING)
 
-    def _hand_out(self, request: TutoringRequest) -> TutoringCase | None:
-        return None if self._lifecycle.paused else self._curriculum.next_case(request.actor)
+    def _hand_out(self, request: TutoringRequest) -> TutoringCase | Correction | None:
+        if self._lifecycle.paused:
+            return None
+        case, awaited = self._curriculum.next_case(request.actor), self._round
+        if case is not None or awaited is None:
+            return case
+        return awaited.next_correction(request)
+
+    def _on_verdict(self, verdict: Verdict) -> None:
+        if (awaited := self._round) is not None:
+            awaited.judge(verdict)
 
     def _on_presence(self, actor: str, alive: bool) -> None:
-        if not alive:
-            self._curriculum.release(actor)
+        if alive:
+            return
+        self._curriculum.release(actor)
+        if (awaited := self._round) is not None:
+            awaited.release(actor)
 
     def _receive(self, inbox: Inbox[Sequence], wait_s: float) -> None:
         while (sequence := inbox.take(timeout_s=wait_s)) is not None:
             episode = sequence.episode
-            if self._curriculum.wants(episode):
+            if self._wants(episode):
                 self._stores[episode.task].add(episode)
-                self._curriculum.shown([episode])
-                LOG.info("sequence %d of %d", self._sequences, self._curriculum.sizes.total())
+                self._note(episode)
+                LOG.info("kept a %s sequence, %d in all", episode.kind, self._sequences)
             # One that is not wanted, such as the second of a case, need not be sent again either.
             self._bus.deliver(self._bus.keys.receipt(episode.actor), Receipt(episode.id))
             wait_s = 0.0
 
+    def _wants(self, episode: Episode) -> bool:
+        """Whether a case or the round of corrections lacks this episode."""
+        awaited = self._round
+        return self._curriculum.wants(episode) or (awaited is not None and awaited.wants(episode))
+
+    def _note(self, episode: Episode) -> None:
+        """This episode is kept: it is not wanted any more."""
+        self._curriculum.shown([episode])
+        if self._round is not None:
+            self._round.shown(episode)
+
+    def _make_round(self) -> Round | None:
+        """The round of corrections that the next epoch has to wait for, if it is a lap's first."""
+        if not self._trainer.round_begins:
+            return None
+        newest = self._run_id, self._trainer.version
+        return Round(self._config, self._trainer.round, newest, self._situations)
+
+    def _end_round(self) -> None:
+        """All corrections of the round are there; what else comes in is for none."""
+        if self._round is not None:
+            LOG.info(
+                "round %d is over: %d corrections, %d episodes of practice judged",
+                self._round.number,
+                self._round.kept,
+                self._round.judged,
+            )
+            self._round = None
+
     def _train(self) -> None:
+        self._end_round()
         with self._training:
             self._trainer.epoch()
             over = pretraining_is_over(self._trainer)
@@ -194,6 +257,7 @@ class LearnerProcess:
                 write_policy(self._trainer, self._folder)
             # the training on disk knows of a version before anyone else does
             LOG.info(self.checkpoint())
+            self._round = self._make_round()
             self._publish()
         elif over or self._trainer.epochs_done % self._config.learner.checkpoint_every_epochs == 0:
             LOG.info(self.checkpoint())

@@ -1,4 +1,4 @@
-"""Training of VMDNN: pre-training of the vision, then coupled training of the rest.
+"""Training of VMDNN: pre-training of the vision, then coupled training of the rest, in laps.
 
     trainer = Trainer(config, TutoringStore(folder))
     while not trainer.finished:
@@ -35,6 +35,7 @@ from learner.checkpoint import (
 )
 from learner.coupled import CoupledTraining
 from learner.intake import Intake
+from learner.laps import Laps
 from learner.optimization import Optimization, Plan
 from learner.pretraining import Classes, Pretraining, classes_of
 from learner.softmax_code import SoftmaxCode
@@ -57,7 +58,7 @@ class Trainer:
     Attributes:
         network: the network.
         stage: that of the last epoch: pre-training or coupled training; or finished.
-        epochs_done: epochs done in this stage.
+        epochs_done: epochs done in this stage, in all laps of it.
         loss: mean loss of the last epoch, or None before the first.
         version: version of the newest policy, 0 for none yet.
     """
@@ -70,7 +71,12 @@ class Trainer:
     _optimization: Optimization | None
 
     def __init__(
-        self, config: Config, store: TutoringStore, pretraining_store: TutoringStore | None = None
+        self,
+        config: Config,
+        store: TutoringStore,
+        pretraining_store: TutoringStore | None = None,
+        *,
+        rounds: int = 0,
     ) -> None:
         """Start from random weights.
 
@@ -80,11 +86,14 @@ class Trainer:
             store: sequences to learn from.
             pretraining_store: sequences for pre-training, when they are others (the paper's have
                 no obstacle).
+            rounds: laps that follow the first, after corrections that somebody adds to the store.
         """
         torch.set_num_threads(config.learner.threads)
         self._config = config
         self._store = store
         self._pretraining_store = store if pretraining_store is None else pretraining_store
+        learner = config.learner
+        self._laps = Laps(learner.epochs, rounds, learner.corrections.epochs)
         self._generator = torch.Generator().manual_seed(config.run.seed)
         self.network = VMDNN(config.network)
         self.network.initialize(
@@ -102,6 +111,8 @@ class Trainer:
         config: Config,
         store: TutoringStore,
         pretraining_store: TutoringStore | None = None,
+        *,
+        rounds: int = 0,
     ) -> Self:
         """Go on where `save` was called.
 
@@ -116,7 +127,7 @@ class Trainer:
                 f"checkpoint {path} is a policy: it can act, but training cannot go on from it;"
                 " take a training checkpoint"
             )
-        trainer = cls(config, store, pretraining_store)
+        trainer = cls(config, store, pretraining_store, rounds=rounds)
         try:
             trainer._resume(checkpoint, training)
         except (KeyError, RuntimeError) as error:
@@ -125,7 +136,7 @@ class Trainer:
 
     @property
     def finished(self) -> bool:
-        """Whether all epochs of both stages are done."""
+        """Whether all epochs of both stages and all laps are done."""
         return self.stage is Stage.FINISHED
 
     @property
@@ -136,8 +147,19 @@ class Trainer:
 
     @property
     def epochs_total(self) -> int:
-        """Epochs that this stage has."""
-        return self._plan().epochs
+        """Epochs that this stage has, in all laps of it."""
+        pretraining = self._config.learner.pretraining
+        return pretraining.epochs if self.stage is Stage.PRETRAINING else self._laps.total
+
+    @property
+    def round(self) -> int:
+        """Round of corrections, from 1, that the next epoch belongs to; 0 in the first lap."""
+        return 0 if self.stage is Stage.PRETRAINING else self._laps.round_at(self.epochs_done)
+
+    @property
+    def round_begins(self) -> bool:
+        """Whether the next epoch is the first after a round of corrections."""
+        return self.round > 0 and self.epochs_done == self._laps.start_of(self.round)
 
     @property
     def sequences(self) -> int:
@@ -155,9 +177,12 @@ class Trainer:
         if self.next_stage is not self.stage:
             self._enter(self.next_stage)
         self._take_in(self._intake.new())
+        if self.round_begins and self._lesson is not None:
+            self._optimization = Optimization(self._lesson, self._plan())
         if self._optimization is None:
             raise UserError(self._intake.complaint())
-        self.loss = loss = self._optimization.epoch(self.epochs_done, self._generator)
+        in_lap = self.epochs_done - self._laps.start_of(self.round)
+        self.loss = loss = self._optimization.epoch(in_lap, self._generator)
         self.epochs_done += 1
         self._finish_if_done()
         return loss
@@ -214,7 +239,7 @@ class Trainer:
                 first.epochs, first.rate, learner.schedule, 0, first.batch, learner.clip_norm
             )
         return Plan(
-            learner.epochs,
+            self._laps.length_of(self.round),
             learner.rate,
             learner.schedule,
             learner.warmup_epochs,
@@ -295,6 +320,8 @@ class Trainer:
             config_digest=self._config.digest(),
             network=self._config.network,
             code=code,
+            cases=len(self._intake.situations),
+            sequences=self.sequences,
             training=training,
         )
 

@@ -220,9 +220,12 @@ class Bus:
         return inbox
 
     def ask(
-        self, key: str, question: Any, answer: type[Answer], *, timeout_s: float = 2.0
+        self, key: str, question: Any, *answers: type[Answer], timeout_s: float = 2.0
     ) -> list[Answer]:
-        """Ask everyone who answers under a key; nobody, or nobody in time, is an empty list."""
+        """Ask everyone who answers under a key with a message of one of the classes `answers`.
+
+        Nobody, or nobody in time, is an empty list.
+        """
         wire = encode(question)
         replies = self._session.get(
             key,
@@ -233,14 +236,14 @@ class Bus:
             encoding=wire.encoding,
             attachment=self._attachment(wire),
         )
-        answers = []
+        given = []
         for reply in replies:
             if reply.ok is not None:
                 try:
-                    answers.append(self.decode(reply.ok, answer))
+                    given.append(self.decode(reply.ok, *answers))
                 except MessageError:
                     continue
-        return answers
+        return given
 
     def answer(self, key: str, question: type[M], callback: Callable[[M], object | None]) -> None:
         """Answer questions under a key with a message, or with None: nothing to say."""

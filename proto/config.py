@@ -14,6 +14,7 @@ from pydantic_core import ErrorDetails
 
 from proto.errors import UserError
 from proto.files import written_whole
+from proto.seeds import TRIALS_BELOW
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -84,17 +85,19 @@ class ActorConfig(_Section):
 
 
 class TutorConfig(_Section):
-    """How the tutor executes its plan when a case is tutored again.
+    """How the tutor executes its plan when a case is tutored again, and how it guides a policy.
 
     Attributes:
         repeats: executions of each case, the first of them clean.
         noise_deg: amplitude of the execution noise.
         noise_correlation_steps: over how many control steps it is correlated.
+        guidance_deg: in a correction, how far neck and arm may be told to be from the clean plan.
     """
 
     repeats: Count = 4
     noise_deg: NotNegative = 1.0
     noise_correlation_steps: Positive = 20.0
+    guidance_deg: NotNegative = 5.0
 
 
 class SubnetConfig(_Section):
@@ -172,12 +175,37 @@ class PretrainingConfig(_Section):
     image_noise: NotNegative = 0.03
 
 
+class CorrectionsConfig(_Section):
+    """Tutoring that goes on when coupled training is over, on the bus only.
+
+    In each round the tutor guides the newest policy in some situations (see
+    `TutorConfig.guidance_deg`). Then training goes on with all sequences: so many epochs with a
+    warm-up and a schedule of their own, and a policy at their end.
+
+    Attributes:
+        rounds: number of rounds.
+        choose: in which situations: those in which the newest policy was not precise in practice
+            (`failures`), random ones, or the tutored cases in their order.
+        sequences: corrections of a round; fewer if there are not as many tutored cases.
+        tries: among failures, no more are looked for once so many episodes of practice were judged.
+        epochs: epochs after each round.
+    """
+
+    rounds: Annotated[int, Field(ge=0)] = 0
+    choose: Literal["failures", "random", "tutored"] = "failures"
+    sequences: Count = 45
+    tries: Count = 200
+    epochs: Count = 200
+
+
 class LearnerConfig(_Section):
     """Coupled training of PFC, M_S and M_F, and when policies are published.
 
     On the bus the learner asks the actors for its sequences: each of `cases` (indices of the task's
     tutored cases, None for all) `tutor.repeats` times; a case handed out for `lease_s` is handed
-    out again. Training starts with `start_sequences` of them, or with all if they are fewer.
+    out again. Training starts with `start_sequences` of them, or with all if they are fewer. It
+    publishes a policy every `publish_every_epochs` and after the last of its `epochs`. Then come
+    the rounds of `corrections`, each with a policy at its end.
     """
 
     cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
@@ -198,13 +226,15 @@ class LearnerConfig(_Section):
     publish_every_epochs: Count = 50
     threads: Count = 1
     pretraining: PretrainingConfig = PretrainingConfig()
+    corrections: CorrectionsConfig = CorrectionsConfig()
 
 
 class EvaluatorConfig(_Section):
     """Trials of unlearned situations, counted for each policy version."""
 
-    trials_per_policy: Count = 52
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1000
+    trials_per_policy: Annotated[int, Field(ge=1, le=2**28)] = 52
+    # the last trial's seed is so below all those that may be tutored
+    seed: Annotated[int, Field(ge=0, le=TRIALS_BELOW - 2**28)] = 1000
     lease_s: Positive = 60.0
 
 
@@ -256,6 +286,13 @@ class Config(_Section):
         """Task of the sequences of pre-training; None where those of coupled training serve."""
         first = self.learner.pretraining
         return None if first.epochs == 0 or first.task == self.task.name else first.task
+
+    @model_validator(mode="after")
+    def _can_find_failures(self) -> Self:
+        corrections = self.learner.corrections
+        if corrections.rounds and corrections.choose == "failures" and not self.actor.practice:
+            raise ValueError("learner.corrections.choose: failures needs actor.practice")
+        return self
 
     @model_validator(mode="after")
     def _can_be_done(self) -> Self:

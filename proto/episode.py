@@ -27,9 +27,16 @@ Id = Annotated[str, Text(64, r"[A-Za-z0-9][A-Za-z0-9._-]*")]
 
 
 class Kind(StrEnum):
-    """Why an episode was played."""
+    """Why an episode was played.
+
+    tutoring: the tutor showed a case.
+    correction: a policy acted while the tutor guided it; learned from as tutoring is.
+    trial: the evaluator asked for it.
+    practice: an actor chose a situation itself.
+    """
 
     TUTORING = "tutoring"
+    CORRECTION = "correction"
     TRIAL = "trial"
     PRACTICE = "practice"
 
@@ -99,8 +106,8 @@ class Episode:
         config_digest: digest of the effective configuration.
         images: (T, 48, 64) uint8, the network's grey picture before normalization.
         actions: (T, 11) float32, what the robot was told (units of `proto.action`).
-        targets: (T, 11) float32, what the policy meant; the clean plan where noise was added to
-            the actions, else equal to them.
+        targets: (T, 11) float32, what was meant: the clean plan where the tutor executed it with
+            noise or guided a policy, else equal to the actions.
         joints_deg: (T, 18) float32, measured before the action: neck, arm, hand motors.
         phases: (T,) uint8, subtask 1..8 of the paper's Experiment I.
         body_names: names of the bodies, B of them.

@@ -38,13 +38,21 @@ class Keys:
 
     @property
     def request_tutoring(self) -> str:
-        """Actor asks the learner: `TutoringRequest`, answered by `TutoringCase` or nothing."""
+        """Actor asks the learner: `TutoringRequest`.
+
+        It is answered by `TutoringCase`, `Correction` or nothing.
+        """
         return f"vmdnn/{self.run}/request/tutoring"
 
     @property
     def request_trial(self) -> str:
         """Actor asks the evaluator: `TrialRequest`, answered by `Trial` or nothing."""
         return f"vmdnn/{self.run}/request/trial"
+
+    @property
+    def verdict(self) -> str:
+        """Evaluator to learner: `Verdict`."""
+        return f"vmdnn/{self.run}/verdict"
 
     def sequence(self, actor: str = ANYONE) -> str:
         """Actor to learner: `Sequence`."""

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Final
 
 from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
-from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Text, message
-from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind
+from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Table, Text, message
+from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind, Outcome
 from proto.keys import Role
 
 EPISODE_LIMIT: Final = 32 * MEBIBYTE
 POLICY_LIMIT: Final = 256 * MEBIBYTE
 
 Count = Annotated[int, Integer(0, 2**31)]
+Seed = Annotated[int, Integer(0, 2**63 - 1)]
+Values = Annotated[Mapping[str, float], Table(Number(), most=32)]
 
 
 @message("policy", 1, limit=POLICY_LIMIT + MEBIBYTE)
@@ -39,10 +42,10 @@ class PolicyVersion:
     weights: Annotated[bytes, Blob(POLICY_LIMIT)]
 
 
-@message("sequence", 1, limit=EPISODE_LIMIT)
+@message("sequence", 2, limit=EPISODE_LIMIT)
 @dataclass(frozen=True)
 class Sequence:
-    """A tutored episode, for the learner."""
+    """A tutored episode or a correction, for the learner."""
 
     episode: Episode
 
@@ -69,12 +72,20 @@ class Receipt:
     episode: Id
 
 
-@message("tutoring_request", 1)
+@message("tutoring_request", 2)
 @dataclass(frozen=True)
 class TutoringRequest:
-    """An actor asks for a case to demonstrate."""
+    """An actor asks for a case to demonstrate, or a situation to be guided in.
+
+    Attributes:
+        actor: who asks.
+        run_id: training that its policy comes from, empty if it has none.
+        policy_version: its policy's version, 0 if it has none.
+    """
 
     actor: Id
+    run_id: Annotated[str, Text(64)]
+    policy_version: Count
 
 
 @message("tutoring_case", 2)
@@ -98,6 +109,44 @@ class TutoringCase:
         return self.case * 1000 + self.repeat
 
 
+@message("correction", 1)
+@dataclass(frozen=True)
+class Correction:
+    """A situation in which the policy of the request is to act while the tutor guides it.
+
+    Attributes:
+        task: name of the task.
+        seed: seed of the episode.
+        situation: the situation's values by name.
+    """
+
+    task: Annotated[str, Text(64)]
+    seed: Seed
+    situation: Values
+
+
+@message("verdict", 1)
+@dataclass(frozen=True)
+class Verdict:
+    """How an episode of practice ended; it tells the learner where tutoring is needed.
+
+    Attributes:
+        run_id: training that the policy comes from.
+        policy_version: its version.
+        task: name of the task.
+        seed: seed of the episode.
+        situation: the situation's values by name.
+        outcome: how it ended.
+    """
+
+    run_id: Id
+    policy_version: Count
+    task: Annotated[str, Text(64)]
+    seed: Seed
+    situation: Values
+    outcome: Outcome
+
+
 @message("trial_request", 1)
 @dataclass(frozen=True)
 class TrialRequest:
@@ -117,10 +166,10 @@ class Trial:
         seed: seed of the situation and of the episode.
     """
 
-    seed: Annotated[int, Integer(0, 2**63 - 1)]
+    seed: Seed
 
 
-@message("live", 1)
+@message("live", 2)
 @dataclass(frozen=True)
 class Live:
     """One control step as it happens.

@@ -48,7 +48,7 @@ class Metrics:
     refused: Count
 
 
-@message("metrics.actor", 1, form="json")
+@message("metrics.actor", 2, form="json")
 @dataclass(frozen=True, kw_only=True)
 class ActorMetrics(Metrics):
     """An actor.
@@ -84,17 +84,20 @@ class Stage(StrEnum):
     FINISHED = "finished"
 
 
-@message("metrics.learner", 1, form="json")
+@message("metrics.learner", 2, form="json")
 @dataclass(frozen=True, kw_only=True)
 class LearnerMetrics(Metrics):
     """The learner.
 
     Attributes:
-        stage: waiting for sequences, pretraining, coupled training, or finished.
+        stage: waiting for sequences or corrections, pretraining, coupled training, or finished.
         epoch: epochs done in this stage.
         epochs_total: epochs that this stage has.
         loss: loss of the last epoch; null at first.
         sequences: tutored sequences that it keeps, those of pre-training counted.
+        round: round of corrections that it waits for or learns from, 0 before the first.
+        corrections: corrections of this round that it keeps.
+        corrections_total: corrections that this round has at most.
         epochs_per_s: epochs per second since the last metrics.
         policy_version: newest version published, 0 for none yet.
         paused: whether it was told to pause.
@@ -107,6 +110,9 @@ class LearnerMetrics(Metrics):
     epochs_total: Count
     loss: Annotated[float | None, Maybe(Number(0.0, 1e9))]
     sequences: Count
+    round: Count
+    corrections: Count
+    corrections_total: Count
     epochs_per_s: Rate
     policy_version: Count
     paused: bool

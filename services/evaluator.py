@@ -12,7 +12,7 @@ from proto.config import Config
 from proto.episode import Episode, Kind, Outcome
 from proto.keys import Role
 from proto.leases import Leases
-from proto.messages import PolicyVersion, Receipt, Rollout, Trial, TrialRequest
+from proto.messages import PolicyVersion, Receipt, Rollout, Trial, TrialRequest, Verdict
 from proto.metrics import EvaluatorMetrics, PolicyScore, Success
 from proto.process import Lifecycle, alone_in_run, membership
 from services.success import Tally
@@ -120,17 +120,37 @@ class Evaluator:
                     episode.seed,
                     episode.outcome.reason,
                 )
+        elif self._is_practice(episode):
+            self._bus.deliver(self._bus.keys.verdict, _verdict(rollout))
         # Practice and what was counted already need not be sent again either.
         self._bus.deliver(self._bus.keys.receipt(episode.actor), Receipt(episode.id))
 
     def _is_trial(self, episode: Episode) -> bool:
         """Whether it is one of the trials that this configuration asks for."""
-        ours = episode.kind is Kind.TRIAL and episode.task == self._config.task.name
-        return ours and episode.seed in self._seeds
+        return self._is(Kind.TRIAL, episode) and episode.seed in self._seeds
+
+    def _is_practice(self, episode: Episode) -> bool:
+        """Whether the learner may hear of it: never of the situations of trials."""
+        return self._is(Kind.PRACTICE, episode) and episode.seed not in self._seeds
+
+    def _is(self, kind: Kind, episode: Episode) -> bool:
+        return episode.kind is kind and episode.task == self._config.task.name
 
     def _counted(self, policy: Policy) -> Mapping[int, Outcome]:
         outcomes = self._book.outcomes(*policy)
         return {seed: outcome for seed, outcome in outcomes.items() if seed in self._seeds}
+
+
+def _verdict(rollout: Rollout) -> Verdict:
+    episode = rollout.episode
+    return Verdict(
+        run_id=rollout.run_id,
+        policy_version=episode.policy_version,
+        task=episode.task,
+        seed=episode.seed,
+        situation=episode.situation,
+        outcome=episode.outcome,
+    )
 
 
 def _score(version: int, outcomes: Iterable[Outcome]) -> PolicyScore:

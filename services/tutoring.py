@@ -147,5 +147,5 @@ def _what_matters(config: Config) -> dict[str, Any]:
         f"{section}.{name}": value
         for section, values in sections.items()
         for name, value in values.items()
-        if (section, name) != ("tutor", "repeats")
+        if (section, name) not in {("tutor", "repeats"), ("tutor", "guidance_deg")}
     }

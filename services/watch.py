@@ -27,6 +27,7 @@ from proto.metrics import (
     Metrics,
     PolicyScore,
     RecorderMetrics,
+    Stage,
     Success,
 )
 
@@ -200,8 +201,18 @@ def tables(view: View) -> RenderableType:
     return Group(*parts)
 
 
+def _stage_words(learner: LearnerMetrics) -> str:
+    """Such as `coupled`, `coupled, round 2`, or what it is waiting for."""
+    if learner.stage is not Stage.WAITING:
+        in_round = learner.round and learner.stage is Stage.COUPLED
+        return f"{learner.stage}, round {learner.round}" if in_round else learner.stage
+    if not learner.corrections_total:
+        return "waiting for sequences"
+    return f"waiting for corrections {learner.corrections}/{learner.corrections_total}"
+
+
 def _learner_words(learner: LearnerMetrics) -> str:
-    words = [f"learner {learner.stage}"]
+    words = [f"learner {_stage_words(learner)}"]
     if learner.epochs_total:
         words.append(f"epoch {learner.epoch}/{learner.epochs_total}")
     if learner.loss is not None:
@@ -226,7 +237,7 @@ def _learner_table(learner: LearnerMetrics) -> Table:
     table = Table("learner", "stage", "epoch", "", "loss", "sequences", "epochs/s", "policy")
     table.add_row(
         learner.id,
-        "paused" if learner.paused else learner.stage,
+        "paused" if learner.paused else _stage_words(learner),
         f"{learner.epoch}/{learner.epochs_total}",
         ProgressBar(total=max(learner.epochs_total, 1), completed=learner.epoch, width=20),
         "" if learner.loss is None else f"{learner.loss:.4f}",

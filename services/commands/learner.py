@@ -23,11 +23,11 @@ def run(arguments: argparse.Namespace) -> int:
     config = config_of(arguments)
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
-    cases = {name: len(task().tutored()) for name, task in TASKS.items()}
+    tasks = {name: task() for name, task in TASKS.items()}
     process = arguments.id or "learner"
     with (
         only_one(config.run_folder, Role.LEARNER, "learner"),
         open_bus(config.hub, config.run.name, Role.LEARNER, process) as bus,
     ):
-        LearnerProcess(config, bus, lifecycle, tutored_cases=cases).run()
+        LearnerProcess(config, bus, lifecycle, tasks=tasks).run()
     return 0

@@ -83,7 +83,7 @@ class School:
         return self._stack.enter_context(bus)
 
     def ask(self) -> list[TutoringCase]:
-        request = TutoringRequest("actor")
+        request = TutoringRequest("actor", "", 0)
         return self.actor.ask(self.actor.keys.request_tutoring, request, TutoringCase)
 
     def ask_until_given(self) -> TutoringCase:

@@ -180,7 +180,7 @@ def test_questions_are_answered_with_a_message_or_with_nothing(shared: Network) 
     learner.answer(KEYS.request_tutoring, TutoringRequest, hand_out)
 
     def ask(name: str) -> list[TutoringCase]:
-        return actor.ask(KEYS.request_tutoring, TutoringRequest(name), TutoringCase)
+        return actor.ask(KEYS.request_tutoring, TutoringRequest(name, "", 0), TutoringCase)
 
     eventually(
         lambda: ask("fail") == [] and ask("asking") == [TutoringCase("experiment1", 3, 1)],
@@ -196,7 +196,7 @@ def test_nobody_to_ask_is_no_answer_at_once(shared: Network) -> None:
     answers: list[list[TutoringCase]] = []
 
     def ask() -> None:
-        request = TutoringRequest("lonely")
+        request = TutoringRequest("lonely", "", 0)
         answers.append(actor.ask("vmdnn/test/nobody", request, TutoringCase, timeout_s=30.0))
 
     thread = threading.Thread(target=ask, daemon=True)
@@ -227,6 +227,11 @@ def test_everything_comes_back_after_the_hub_was_killed() -> None:
         learner, actor = net.join(Role.LEARNER, "learner"), net.join(Role.ACTOR, "actor")
         versions: list[int] = []
         presence: list[tuple[str, bool]] = []
+
+        def answers() -> list[TutoringCase]:
+            question = TutoringRequest("actor", "", 0)
+            return actor.ask(KEYS.request_tutoring, question, TutoringCase)
+
         actor.announce()
         learner.watch_presence(Role.ACTOR, lambda name, alive: presence.append((name, alive)))
         learner.answer(
@@ -238,15 +243,12 @@ def test_everything_comes_back_after_the_hub_was_killed() -> None:
 
         net.hub.kill()
         eventually(lambda: presence[-1] == ("actor", False), "everyone is gone without a hub")
-        assert actor.ask(KEYS.request_tutoring, TutoringRequest("actor"), TutoringCase) == []
+        assert answers() == []
         learner.publish_newest(KEYS.policy, policy(2))  # into the void
         net.start_hub()
         eventually(lambda: presence[-1] == ("actor", True), "the actor is back")
         eventually(lambda: versions[-1] == 2, "what was published without a hub arrives")
-        eventually(
-            lambda: actor.ask(KEYS.request_tutoring, TutoringRequest("actor"), TutoringCase) != [],
-            "questions are answered again",
-        )
+        eventually(lambda: answers() != [], "questions are answered again")
 
 
 def test_presence_ends_with_the_process(shared: Network) -> None:

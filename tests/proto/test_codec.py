@@ -206,7 +206,7 @@ def test_a_field_of_another_kind_is_refused_by_name(
         (lambda e: e.update(seed=-1), "episode.seed", "got -1"),
         (lambda e: e.update(id="../../etc"), "episode.id", "'../../etc'"),
         (lambda e: e.update(task="\x1b[2J"), "episode.task", "printable"),
-        (lambda e: e.update(kind="party"), "episode.kind", "tutoring, trial, practice"),
+        (lambda e: e.update(kind="party"), "episode.kind", "tutoring, correction, trial, practice"),
         (lambda e: e["outcome"].update(strict=1), "episode.outcome.strict", "true or false"),
         (lambda e: e["situation"].update(x="far"), "episode.situation['x']", "number, got text"),
         (lambda e: e["situation"].update(x=float("nan")), "episode.situation['x']", "got nan"),
@@ -245,9 +245,9 @@ def test_without_its_check_a_mistake_is_refused_by_the_reader(sequence: Sequence
 
 def test_another_message_or_version_is_refused(sequence: Sequence) -> None:
     wire = encode(sequence)
-    assert wire.encoding == "application/msgpack;vmdnn.sequence.1"
+    assert wire.encoding == "application/msgpack;vmdnn.sequence.2"
     for encoding in (
-        "application/msgpack;vmdnn.sequence.2",
+        "application/msgpack;vmdnn.sequence.1",
         "application/msgpack;vmdnn.rollout.1",
         "zenoh/bytes",
         "",
