@@ -7,21 +7,43 @@ sequence is computed once, when the sequence comes in.
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from learner.divergence import divergence
+from learner.interpolation import Neighbours
 from learner.sequences import Sequences
 from learner.softmax_code import SoftmaxCode
 from learner.vision_input import vision_input
 from learner.vmdnn import VMDNN
 from proto.action import ACTION_NAMES
+from proto.config import LearnerConfig
 from proto.episode import Episode, Floats
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class _Material:
+    """All sequences side by side.
+
+    Attributes:
+        sequences: what is seen and the teacher's outputs.
+        spread: (V_S units,) standard deviation of what each unit sees.
+        targets: (S, T, 11) float32, the teacher's actions.
+        neighbours: whose situations are beside each other.
+    """
+
+    sequences: Sequences
+    spread: Tensor
+    targets: Tensor
+    neighbours: Neighbours
 
 
 class CoupledTraining:
@@ -33,25 +55,26 @@ class CoupledTraining:
     """
 
     def __init__(
-        self, network: VMDNN, code: SoftmaxCode, vision_noise: float, generator: torch.Generator
+        self, network: VMDNN, code: SoftmaxCode, config: LearnerConfig, generator: torch.Generator
     ) -> None:
         """Begin without sequences.
 
         Args:
             network: the network, of which the vision stays as it is.
             code: how the outputs code actions.
-            vision_noise: disturbance of V_S, see `LearnerConfig`.
-            generator: draws it.
+            config: how V_S is disturbed, and how often sequences are mixed.
+            generator: draws both.
         """
         self.code = code
         self.parameters = network.coupled_parameters()
         self._network = network
-        self._vision_noise = vision_noise
+        self._config = config
         self._generator = generator
+        self._situations: list[Mapping[str, float]] = []
         self._seen: list[Tensor] = []
         self._codes: list[Tensor] = []
         self._targets: list[Floats] = []
-        self._sequences: Sequences | None = None
+        self._material: _Material | None = None
 
     def __len__(self) -> int:
         return len(self._seen)
@@ -64,25 +87,47 @@ class CoupledTraining:
             self._seen.append(self._network.see(images[None])[0])
         self._codes.append(torch.from_numpy(self.code.encode(episode.targets)))
         self._targets.append(episode.targets)
-        self._sequences = None
+        self._situations.append(episode.situation)
+        self._material = None
 
     def loss(self, chosen: Tensor) -> Tensor:
         """Mean divergence of eq. (5), for the sequences with these indices."""
-        if self._sequences is None:
-            self._sequences = Sequences.stacked(self._seen, self._codes)
-            self._spread = self._sequences.seen.std((0, 1))
-        return divergence(self._network, self._sequences, chosen, shift=self._wrongly(len(chosen)))
+        material = self._all()
+        shift = self._wrongly(len(chosen), material.spread)
+        sequences = material.sequences
+        if self._config.interpolation:
+            sequences = self._mixed(chosen, material)
+            chosen = torch.arange(len(chosen))
+        return divergence(self._network, sequences, chosen, shift=shift)
 
-    def _wrongly(self, count: int) -> Tensor | None:
+    def _all(self) -> _Material:
+        """Everything taken in, side by side."""
+        if self._material is None:
+            sequences = Sequences.stacked(self._seen, self._codes)
+            self._material = _Material(
+                sequences,
+                spread=sequences.seen.std((0, 1)),
+                targets=pad_sequence(list(map(torch.from_numpy, self._targets)), True),
+                neighbours=Neighbours(self._situations, list(map(len, self._seen))),
+            )
+        return self._material
+
+    def _mixed(self, chosen: Tensor, material: _Material) -> Sequences:
+        """These sequences, a share of them mixed with those of neighbouring situations."""
+        share, sequences = self._config.interpolation, material.sequences
+        mixture = material.neighbours.mixture(chosen, share, self._generator)
+        codes = torch.from_numpy(self.code.encode(mixture.of(material.targets).numpy()))
+        return Sequences.of(mixture.of(sequences.seen), codes, sequences.mask[chosen])
+
+    def _wrongly(self, count: int, spread: Tensor) -> Tensor | None:
         """How wrongly V_S sees some sequences, each in one way from its start to its end.
 
-        Between the tutored situations the network so sees what it has learned to act on, and
-        interpolates instead of snapping to the nearest of them.
+        The network so learns not to rely on small differences in what it sees.
         """
-        if self._vision_noise == 0:
+        if self._config.vision_noise == 0:
             return None
-        wrong = torch.randn(count, len(self._spread), generator=self._generator)
-        return self._vision_noise * self._spread * wrong
+        wrong = torch.randn(count, len(spread), generator=self._generator)
+        return self._config.vision_noise * spread * wrong
 
     def mean_errors(self) -> NDArray[np.float64]:
         """(11,) mean distance of the decoded outputs from the targets, over all sequences."""

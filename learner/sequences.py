@@ -32,13 +32,16 @@ class Sequences:
     def stacked(cls, seen: Sequence[Tensor], codes: Sequence[Tensor]) -> Self:
         """Put sequences (T, ...) of any lengths side by side."""
         masks = [one.new_ones(len(one)) for one in seen]
-        all_codes = pad_sequence(list(codes), batch_first=True)
-        return cls(
-            seen=pad_sequence(list(seen), batch_first=True),
-            codes=all_codes,
-            mask=pad_sequence(masks, batch_first=True),
-            code_entropies=torch.xlogy(all_codes, all_codes).sum((-1, -2)),
+        return cls.of(
+            pad_sequence(list(seen), batch_first=True),
+            pad_sequence(list(codes), batch_first=True),
+            pad_sequence(masks, batch_first=True),
         )
+
+    @classmethod
+    def of(cls, seen: Tensor, codes: Tensor, mask: Tensor) -> Self:
+        """Sequences that are filled up already."""
+        return cls(seen, codes, mask, torch.xlogy(codes, codes).sum((-1, -2)))
 
     def to(self, device: torch.device) -> Self:
         """The same on another device."""

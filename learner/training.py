@@ -273,8 +273,7 @@ class Trainer:
         return Pretraining(self.network, classes, config, self._generator)
 
     def _coupled_training(self, code: SoftmaxCode) -> CoupledTraining:
-        vision_noise = self._config.learner.vision_noise
-        return CoupledTraining(self.network, code, vision_noise, self._generator)
+        return CoupledTraining(self.network, code, self._config.learner, self._generator)
 
     def _coupled(self) -> CoupledTraining:
         if not isinstance(self._lesson, CoupledTraining):

@@ -46,10 +46,15 @@ TaskName = Literal["experiment1", "reaching"]
 """Experiment I, or the same without an obstacle, which the vision is pre-trained on."""
 
 
+Attention = Literal["active", "fixed"]
+"""Whether the robot turns its head and focuses, or keeps both as they are at the start."""
+
+
 class TaskConfig(_Section):
-    """Which task is tutored and tested."""
+    """Which task is tutored and tested, and whether gaze and focus have a part in it."""
 
     name: TaskName = "experiment1"
+    attention: Attention = "active"
 
 
 class SimulatorConfig(_Section):
@@ -219,7 +224,10 @@ class LearnerConfig(_Section):
     clip_norm: Positive | None = 1.0
     # in coupled training: disturbance of each unit of V_S, another one for each sequence and epoch,
     # in standard deviations of the unit's activity
-    vision_noise: NotNegative = 0.3
+    vision_noise: NotNegative = 0.15
+    # share of the sequences that are replaced by a mixture with those of a neighbouring situation,
+    # so that the network learns what to do between the tutored ones
+    interpolation: Annotated[float, Field(ge=0, le=1)] = 0.7
     initial_range: Positive = 0.1
     initial_range_pfc_input: Positive = 0.2
     checkpoint_every_epochs: Count = 50

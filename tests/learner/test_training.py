@@ -17,6 +17,7 @@ from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.metrics import Stage
 
+UNDISTURBED = {"vision_noise": 0.0, "interpolation": 0.0}
 RANGES = np.array([value.maximum - value.minimum for value in ACTION_VALUES])
 
 MakeConfig = Callable[..., Config]
@@ -45,7 +46,7 @@ def same_network(one: Trainer, other: Trainer) -> bool:
 def test_it_learns_to_tell_situations_apart(
     store: TutoringStore, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:
-    trainer = Trainer(small_config(pretraining=60, epochs=300, batch=60, vision_noise=0.0), store)
+    trainer = Trainer(small_config(pretraining=60, epochs=300, batch=60, **UNDISTURBED), store)
     train(trainer, 60)
     first, *_, last = train(trainer, 300)
     assert last < 0.15 * first
