@@ -29,7 +29,7 @@ ARM_OPEN = Arm(OPEN_DEG, TABLE_DROP_M)
 
 
 @given(situations)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_plan_stays_within_the_limits_and_moves_smoothly(situation):
     actions = plan(situation)
     low = [value.minimum for value in ACTION_VALUES]
@@ -41,7 +41,7 @@ def test_plan_stays_within_the_limits_and_moves_smoothly(situation):
 
 
 @given(situations)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_open_arm_passes_the_obstacle_closely_but_clear(situation):
     actions = plan(situation)
     box = Cuboid(np.array(obstacle_pose(situation).position_m), np.array(OBSTACLE_SIZE_M))

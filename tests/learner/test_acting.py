@@ -95,7 +95,7 @@ def networks(draw: st.DrawFn) -> NetworkConfig:
 
 
 @pytest.mark.usefixtures("_compiled")
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(config=networks())
 def test_any_network_gives_the_numbers_of_numpy(config: NetworkConfig) -> None:
     weights = max(np.prod(shape[1:]) for shape in parameter_shapes(config).values())

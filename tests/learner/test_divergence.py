@@ -106,7 +106,7 @@ def assert_alike(results: list[Tensor], expected: list[Tensor], tolerance: float
 
 
 @pytest.mark.usefixtures("_compiled")
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     config=configs(),
     lengths=st.lists(st.integers(1, 40), min_size=1, max_size=20),

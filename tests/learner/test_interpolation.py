@@ -53,12 +53,12 @@ def test_mixtures_lie_between_and_a_little_beyond() -> None:
 @given(share=st.floats(0, 1), seed=st.integers(0, 2**31))
 def test_a_share_is_mixed_and_the_rest_stays(share: float, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
-    chosen = torch.randint(9, (2000,), generator=generator)
+    chosen = torch.randint(9, (400,), generator=generator)
     mixture = Neighbours(GRID, [10] * 9).mixture(chosen, share, generator)
     values = torch.randn(9, 3, generator=generator)
     kept = mixture.weights == 0
     assert torch.equal(mixture.of(values)[kept], values[chosen][kept])
-    assert abs((~kept).float().mean() - share) < 0.06
+    assert abs((~kept).float().mean() - share) < 0.15
 
 
 def test_a_mixture_is_linear() -> None:

@@ -56,7 +56,7 @@ def gradients(activity: Tensor, by: list[Tensor]) -> list[Tensor]:
     return list(torch.autograd.grad((activity * weights).sum(), by))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(subnet=subnets(), sequences=st.integers(1, 4), steps=st.integers(1, 13))
 def test_kernel_agrees_with_autograd(
     subnet: tuple[Maps, int, int], sequences: int, steps: int

@@ -84,7 +84,7 @@ def same(one: object, other: object) -> bool:
     return type(one) is type(other) and repr(one) == repr(other)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(episode=episodes())
 def test_every_field_comes_back_exactly(
     episode: Episode, tmp_path_factory: pytest.TempPathFactory
@@ -151,7 +151,7 @@ def test_another_mcap_reader_understands_it(tmp_path: Path, make_episode: MakeEp
     assert metadata["episode"]["config_digest"] == "c0ffee"
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_a_file_cut_off_anywhere_is_refused(
     data: st.DataObject, make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory
@@ -164,7 +164,7 @@ def test_a_file_cut_off_anywhere_is_refused(
         read_episode(path)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(data=st.data())
 def test_a_flipped_byte_is_refused_or_harmless(
     data: st.DataObject, make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory

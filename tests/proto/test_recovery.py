@@ -43,7 +43,7 @@ def assert_is_start_of(part: Episode, whole: Episode) -> None:
         assert np.array_equal(getattr(part, name), getattr(whole, name)[: part.steps]), name
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_a_file_cut_off_anywhere_keeps_its_whole_steps(
     data: st.DataObject,
