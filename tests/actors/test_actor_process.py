@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from subprocess import Popen
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 
 from actors.tasks.registry import make_task
+from actors.tutor.plan import plan
 from learner.store import TutoringStore
 from learner.training import Trainer
 from proto.bus import Bus, open_bus
@@ -26,6 +28,7 @@ from proto.messages import (
     Command,
     Control,
     ControlReply,
+    Correction,
     Live,
     PolicyVersion,
     Receipt,
@@ -37,6 +40,7 @@ from proto.messages import (
     TutoringRequest,
 )
 from proto.metrics import ActorMetrics
+from proto.seeds import PRACTICE
 
 MakeEpisode = Callable[..., Episode]
 TASK = make_task(TaskConfig())
@@ -71,7 +75,8 @@ class Theatre:
             *("--connect", self.endpoint, "--set", f"run.folder={folder}"),
             *("--set", "run.name=test", "--set", "simulator.render=false"),
         )
-        self.cases: list[TutoringCase] = []
+        self.cases: list[TutoringCase | Correction] = []
+        self.requests: list[TutoringRequest] = []
         self.trials: list[Trial] = []
         self.sequences: list[Episode] = []
         self.rollouts: list[Rollout] = []
@@ -86,7 +91,7 @@ class Theatre:
         )
         self._lock = threading.Lock()
         keys = self.bus.keys
-        self.bus.answer(keys.request_tutoring, TutoringRequest, lambda _: self._next(self.cases))
+        self.bus.answer(keys.request_tutoring, TutoringRequest, self._on_request)
         self.bus.answer(keys.request_trial, TrialRequest, lambda _: self._next(self.trials))
         self.bus.subscribe(keys.sequence(), self._on_sequence, Sequence)
         self.bus.subscribe(keys.rollout(), self._on_rollout, Rollout)
@@ -113,7 +118,11 @@ class Theatre:
         control = self.bus.keys.control(Role.ACTOR)
         return [r.note for r in self.bus.ask(control, Control(command), ControlReply)]
 
-    def _next(self, things: list[object]) -> object | None:
+    def _on_request(self, request: TutoringRequest) -> object | None:
+        self.requests.append(request)
+        return self._next(self.cases)
+
+    def _next(self, things: list[Any]) -> object | None:
         with self._lock:
             return things.pop(0) if things else None
 
@@ -175,6 +184,7 @@ def test_it_shows_cases_plays_trials_and_practises(
     assert dict(trial.episode.situation) == dict(TASK.sample(1234))
     assert trial.episode.outputs is not None
     assert practice.episode.kind is Kind.PRACTICE
+    assert practice.episode.seed in PRACTICE
 
     assert theatre.command(Command.PAUSE) == ["paused"]
     paused = theatre.tells(lambda told: told.paused and told.steps_per_s == 0)
@@ -183,6 +193,32 @@ def test_it_shows_cases_plays_trials_and_practises(
     assert theatre.command(Command.RESUME) == ["resumed"]
     eventually(lambda: len(theatre.sequences) == 4, "it plays again")
     assert stop(theatre.actor) == 0
+
+
+def test_its_policy_is_guided_where_the_learner_says(
+    theatre: Theatre, policy: Callable[..., PolicyVersion]
+) -> None:
+    situation = dict(TASK.sample(3))
+    asked = Correction("experiment1", 3, situation)
+    theatre.cases.append(asked)  # has no policy yet
+    theatre.start_actor("--set", "tutor.guidance_deg=2")
+    eventually(lambda: "no policy to be guided" in theatre.log.read_text(), "a warning")
+    assert {(r.run_id, r.policy_version) for r in theatre.requests} == {("", 0)}
+
+    theatre.publish(policy(4))
+    eventually(lambda: TutoringRequest("mime", "training", 4) in theatre.requests, "it holds it")
+    outside = {**situation, "object_y_m": 0.9}
+    theatre.cases += [Correction("experiment1", 4, outside), asked]
+    eventually(lambda: len(theatre.sequences) == 1, "a correction")
+    assert "object_y_m = 0.9 lies outside" in theatre.log.read_text()
+    (episode,) = theatre.sequences
+    assert (episode.kind, episode.policy, episode.policy_version) == (Kind.CORRECTION, "guided", 4)
+    assert (episode.seed, dict(episode.situation)) == (3, situation)
+    np.testing.assert_allclose(episode.targets, plan(situation), atol=1e-4)
+    off = np.abs(episode.actions - episode.targets)
+    assert off.max() <= 2.0 + 1e-4
+    assert off.max() > 1.0, "it is the policy that acts"
+    theatre.tells(lambda told: told.outbox == 0)
 
 
 def test_a_policy_changes_between_episodes_only(

@@ -13,21 +13,28 @@ from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 
 from actors.tasks.registry import make_task
-from learner.checkpoint import load_checkpoint, pretraining_file, training_file
+from learner.checkpoint import (
+    checkpoint_from_bytes,
+    load_checkpoint,
+    pretraining_file,
+    training_file,
+)
 from learner.policy import NetworkPolicy
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig, TaskConfig
-from proto.episode import Episode, Kind
+from proto.episode import Episode, Kind, Outcome, Reason
 from proto.keys import Role
 from proto.messages import (
     Command,
     Control,
     ControlReply,
+    Correction,
     PolicyVersion,
     Receipt,
     Sequence,
     TutoringCase,
     TutoringRequest,
+    Verdict,
 )
 from proto.metrics import LearnerMetrics, Stage
 from proto.recording import read_episode
@@ -45,6 +52,9 @@ SETTINGS = {
     "learner.checkpoint_every_epochs": 7,
     "done.policy_versions": 3,
 }
+
+
+FAILED = Outcome(False, False, False, Reason.NOT_LIFTED, 0.0, 1, 2, 3, 4, 5, 80, -1)
 
 
 def case(number: int, repeat: int, task: str = "experiment1") -> TutoringCase:
@@ -82,19 +92,51 @@ class School:
         bus = open_bus(HubConfig(endpoint=self.endpoint), "test", Role.ACTOR, name)
         return self._stack.enter_context(bus)
 
-    def ask(self) -> list[TutoringCase]:
-        request = TutoringRequest("actor", "", 0)
-        return self.actor.ask(self.actor.keys.request_tutoring, request, TutoringCase)
+    def ask(self) -> list[TutoringCase | Correction]:
+        """Ask as an actor that holds the newest policy it heard of."""
+        newest = [(policy.run_id, policy.version) for policy in self.policies[-1:]]
+        request = TutoringRequest("actor", *(newest[0] if newest else ("", 0)))
+        key = self.actor.keys.request_tutoring
+        answers: list[TutoringCase | Correction]
+        answers = self.actor.ask(key, request, TutoringCase, Correction)
+        return answers
 
-    def ask_until_given(self) -> TutoringCase:
-        cases: list[TutoringCase] = []
+    def ask_until_given(self) -> TutoringCase | Correction:
+        given: list[TutoringCase | Correction] = []
 
-        def given() -> bool:
-            cases.extend(self.ask())
-            return bool(cases)
+        def asked() -> bool:
+            given.extend(self.ask())
+            return bool(given)
 
-        eventually(given, "a case to show")
-        return cases[0]
+        eventually(asked, "something to show")
+        return given[0]
+
+    def correction(self, asked: Correction, **fields: object) -> Episode:
+        given = {
+            "id": f"corrected{asked.seed}",
+            "task": asked.task,
+            "seed": asked.seed,
+            "situation": dict(asked.situation),
+            "policy_version": self.policies[-1].version,
+            **fields,
+        }
+        return self._make_episode(20, kind=Kind.CORRECTION, actor="actor", **given)
+
+    def practise_in_vain(self, seed: int) -> Correction:
+        """The policy fails in practice, so it is guided there."""
+        task, newest = make_task(TaskConfig()), self.policies[-1]
+        policy = {"run_id": newest.run_id, "policy_version": newest.version, "task": task.name}
+        verdict = Verdict(seed=seed, situation=task.sample(seed), outcome=FAILED, **policy)
+        asked: list[TutoringCase | Correction] = []
+
+        def heard() -> bool:
+            self.actor.deliver(self.actor.keys.verdict, verdict)
+            asked.extend(self.ask())
+            return bool(asked)
+
+        eventually(heard, "a correction is asked for")
+        assert isinstance(asked[0], Correction)
+        return asked[0]
 
     def episode(self, shown: TutoringCase, **fields: object) -> Episode:
         task = make_task(TaskConfig.model_validate({"name": shown.task}))
@@ -230,6 +272,48 @@ def test_a_killed_learner_publishes_its_policy_again_and_goes_on(school: School)
     assert [policy.epoch for policy in school.policies] == [5 * version for version in versions]
     assert school.ask() == [], "everything was shown before"
     school.tells(lambda told: told.done and told.sequences == 3)
+
+
+def test_its_policy_is_corrected_where_it_fails_and_it_learns_on(school: School) -> None:
+    corrections = {"rounds": 1, "sequences": 3, "tries": 5, "epochs": 4}
+    words = [f"--set=learner.corrections.{name}={value}" for name, value in corrections.items()]
+    words += ["--set", "learner.epochs=6", "--set", "done.policy_versions=3"]
+    school.start(*words)
+    school.show_all()
+    told = school.tells(lambda told: told.stage is Stage.WAITING and told.round == 1)
+    assert (told.epoch, told.epochs_total, told.policy_version) == (6, 10, 2)
+    assert (told.corrections, told.corrections_total, told.done) == (0, 3, False)
+    eventually(
+        lambda: [p.epoch for p in school.policies] == [5, 6], "the policies of the first lap"
+    )
+    assert school.ask() == [], "it knows of no failure"
+
+    first, second = school.practise_in_vain(2**30), school.practise_in_vain(2**30 + 1)
+    task = make_task(TaskConfig())
+    assert first == Correction("experiment1", 2**30, task.sample(2**30))
+    school.send(school.correction(first))
+    school.send(school.correction(first, id="the-same-once-more"))
+    school.send(school.correction(first, id="of-another-policy", policy_version=1))
+    school.tells(lambda told: told.corrections == 1)
+
+    # what was asked for and shown before is not forgotten
+    school.process.kill()
+    school.process.wait()
+    school.policies.clear()
+    school.start(*words)
+    told = school.tells(lambda told: told.stage is Stage.WAITING)
+    assert (told.corrections, told.sequences) == (1, 4)
+    eventually(lambda: [p.version for p in school.policies] == [2], "the newest policy again")
+    school.send(school.correction(second))
+    school.send(school.correction(school.practise_in_vain(2**30 + 2)))
+
+    told = school.tells(lambda told: told.stage is Stage.FINISHED)
+    assert (told.epoch, told.sequences, told.policy_version, told.done) == (10, 6, 3, True)
+    eventually(lambda: school.policies[-1].version == 3, "a policy of the round")
+    metadata = checkpoint_from_bytes(school.policies[-1].weights, "").metadata
+    assert (metadata.epoch, metadata.cases, metadata.sequences) == (10, 6, 6)
+    assert school.ask() == []
+    assert stop(school.process) == 0
 
 
 def test_it_obeys_and_a_clean_stop_loses_no_epoch(school: School) -> None:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from learner.checkpoint import checkpoint_from_bytes
+from learner.offline import policy_is_due
 from learner.policy import NetworkPolicy
 from learner.store import TutoringStore
 from learner.training import Trainer
@@ -120,6 +122,91 @@ def test_resumed_training_is_bit_identical(
     assert trainer.finished
     assert same_network(trainer, whole)
     assert trainer.policy_bytes(1) == whole.policy_bytes(1)
+
+
+def train_in_laps(
+    trainer: Trainer, store: TutoringStore, episodes: Sequence[Episode], end: int
+) -> list[float]:
+    """Train to an epoch; a correction comes in before each round."""
+    losses = []
+    while trainer.epochs_done < end:
+        if trainer.round_begins:
+            number = trainer.round
+            given = {
+                "id": f"corrected-{number}",
+                "kind": Kind.CORRECTION,
+                "situation": {"a": number},
+            }
+            store.add(replace(episodes[number], **given))
+        losses.append(trainer.epoch())
+    return losses
+
+
+@pytest.mark.parametrize("interrupted_at", [2, 3, 4, 5, 6, 7])
+def test_each_round_is_a_lap_and_can_be_resumed_anywhere(
+    tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes, interrupted_at: int
+) -> None:
+    config = small_config(pretraining=0, epochs=3, corrections={"epochs": 2})
+    stores = [TutoringStore(tmp_path / name) for name in ("whole", "interrupted")]
+    for store in stores:
+        for episode in bar_episodes():
+            store.add(episode)
+    whole = Trainer(config, stores[0], rounds=2)
+    losses = train_in_laps(whole, stores[0], bar_episodes(), 7)
+    assert whole.finished
+    assert (whole.epochs_total, whole.sequences) == (7, 6)
+
+    trainer = Trainer(config, stores[1], rounds=2)
+    before = train_in_laps(trainer, stores[1], bar_episodes(), interrupted_at)
+    path = tmp_path / "training.safetensors"
+    trainer.save(path)
+    again = TutoringStore(stores[1].folder)
+    resumed = Trainer.restore(path, config, again, rounds=2)
+    assert (resumed.round, resumed.round_begins) == (trainer.round, trainer.round_begins)
+    assert before + train_in_laps(resumed, again, bar_episodes(), 7) == losses
+    assert resumed.finished
+    assert resumed.policy_bytes(1) == whole.policy_bytes(1)
+
+
+def test_each_lap_has_a_schedule_of_its_own(store: TutoringStore, small_config: MakeConfig) -> None:
+    config = small_config(pretraining=0, epochs=20, corrections={"epochs": 20})
+    trainer = Trainer(config, store, rounds=1)
+
+    def step() -> float:
+        before = trainer.network.outputs.bias.detach().clone()
+        trainer.epoch()
+        return float((trainer.network.outputs.bias.detach() - before).abs().max())
+
+    steps = [step() for _ in range(40)]
+    assert trainer.finished
+    for first in (0, 20):  # it rises to the third epoch, and falls to the last
+        lap = steps[first : first + 20]
+        assert lap[19] < 0.1 * lap[2]
+
+
+def test_policies_of_each_lap_know_what_they_learned_from(
+    store: TutoringStore, small_config: MakeConfig, bar_episodes: MakeEpisodes
+) -> None:
+    config = small_config(
+        pretraining=2, epochs=6, publish_every_epochs=4, corrections={"epochs": 5}
+    )
+    store.add(replace(bar_episodes()[0], id="the-same-case-again"))
+    trainer = Trainer(config, store, rounds=2)
+    due = []
+    while not trainer.finished:
+        train_in_laps(trainer, store, bar_episodes(), trainer.epochs_done + 1)
+        if policy_is_due(trainer, config.learner):
+            due.append(checkpoint_from_bytes(trainer.policy_bytes(len(due) + 1), "").metadata)
+    assert [(policy.epoch, policy.cases, policy.sequences) for policy in due] == [
+        (4, 4, 5),
+        (6, 4, 5),
+        (11, 5, 6),
+        (16, 6, 7),
+    ]
+    # without actors there are no corrections, whatever the config says
+    assert Trainer(config, store).epochs_total == 2
+    offline = Trainer(small_config(pretraining=0, corrections={"rounds": 3}), store)
+    assert offline.epochs_total == 6
 
 
 def test_sequences_may_come_while_training_goes_on(

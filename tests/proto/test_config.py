@@ -31,6 +31,11 @@ def written(folder: Path, text: str) -> Path:
         ("simulator: {control_period_s: 0.1, physics_period_s: 0.03}", "whole multiple"),
         ("done: {trials: 53}", "done.trials"),
         ("hub: {endpoint: 'localhost:7447'}", "hub.endpoint"),
+        ("evaluator: {seed: 1073741824}", "evaluator.seed"),  # that may be practised, and corrected
+        (
+            "{actor: {practice: false}, learner: {corrections: {rounds: 1}}}",
+            "failures needs actor.practice",
+        ),
         ("- a list", "expected `section: ...` lines"),
         ("learner: {rate", "cannot be read"),
     ],

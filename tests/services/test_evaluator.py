@@ -24,6 +24,7 @@ from proto.messages import (
     Rollout,
     Trial,
     TrialRequest,
+    Verdict,
 )
 from proto.metrics import EvaluatorMetrics
 
@@ -52,6 +53,8 @@ class Field:
         self.learner.subscribe(
             self.learner.keys.metrics(Role.EVALUATOR), self._listen, EvaluatorMetrics
         )
+        self.verdicts: list[Verdict] = []
+        self.learner.subscribe(self.learner.keys.verdict, self.verdicts.append, Verdict)
         self.process = self.start()
 
     def start(self) -> Popen[bytes]:
@@ -80,6 +83,9 @@ class Field:
 
         eventually(given, f"a trial of policy {version}")
         return seeds[0]
+
+    def verdicts_by_seed(self) -> dict[int, Verdict]:
+        return {verdict.seed: verdict for verdict in self.verdicts}
 
     def tells(self, what: Callable[[EvaluatorMetrics], bool]) -> EvaluatorMetrics:
         eventually(lambda: self.told is not None and what(self.told), "the metrics it should tell")
@@ -145,6 +151,24 @@ def test_every_policy_gets_the_same_situations_each_counted_once(field: Field) -
     assert told.done
     assert told.leases == 0
     assert field.ask(actor, 2) == [], "the newest policy is counted in full"
+
+
+def test_the_learner_hears_of_practice_but_never_of_the_situations_of_trials(
+    field: Field,
+) -> None:
+    actor = field.join(Role.ACTOR, "a")
+    field.publish(1)
+    field.ask_until_given(actor, 1)
+    field.send(actor, 70, 1, outcome=NOT_LIFTED)
+    field.send(actor, 70, 1, id="not-even-if-practised", kind=Kind.PRACTICE, outcome=NOT_LIFTED)
+    field.send(actor, 99, 1, id="a-trial-that-nobody-asked-for")
+    field.send(actor, 98, 1, id="another-task", kind=Kind.PRACTICE, task="reaching")
+    practised = field.send(actor, 2**30, 1, kind=Kind.PRACTICE, outcome=NOT_LIFTED)
+    eventually(lambda: bool(field.verdicts), "a verdict")
+    assert set(field.verdicts_by_seed()) == {2**30}
+    told = field.verdicts_by_seed()[2**30]
+    assert (told.run_id, told.policy_version, told.task) == ("training", 1, "experiment1")
+    assert (told.outcome, dict(told.situation)) == (NOT_LIFTED, dict(practised.situation))
 
 
 def test_a_killed_evaluator_carries_on_with_what_it_counted(field: Field) -> None:

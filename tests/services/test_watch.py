@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -38,7 +39,8 @@ ACTOR = ActorMetrics(
 )  # fmt: skip
 LEARNER = LearnerMetrics(
     id="l", time_s=1.0, refused=0, stage=Stage.COUPLED, epoch=120, epochs_total=2500, loss=0.4321,
-    sequences=45, round=0, corrections=0, corrections_total=0, epochs_per_s=12.5, policy_version=3, paused=False, done=False,
+    sequences=45, round=0, corrections=0, corrections_total=0, epochs_per_s=12.5, policy_version=3,
+    paused=False, done=False,
 )  # fmt: skip
 
 
@@ -172,6 +174,24 @@ def test_a_line_says_it_all_briefly() -> None:
         "learner coupled, epoch 120/2500, loss 0.4321, 45 sequences, 12.5 epochs/s, policy 3"
         " | 1 actor, 81 steps/s, 17 episodes | policy 3 strict 44 of 52, 85 % (72 to 92)"
     )
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"stage": Stage.WAITING}, "waiting for sequences"),
+        (
+            {"stage": Stage.WAITING, "round": 2, "corrections": 12, "corrections_total": 45},
+            "waiting for corrections 12/45",
+        ),
+        ({"round": 2}, "coupled, round 2"),
+        ({"stage": Stage.FINISHED, "round": 2}, "finished"),
+    ],
+)
+def test_what_the_learner_is_at(given: dict[str, Any], said: str) -> None:
+    view = view_of(replace(LEARNER, **given))
+    assert summary_line(view).startswith(f"learner {said}, epoch")
+    assert f" {said} " in shown(view)
 
 
 def test_a_view_of_nothing_can_be_shown() -> None:
