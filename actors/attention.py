@@ -28,6 +28,13 @@ def clip_action(action: Array) -> Array:
     return np.asarray(action.clip(_MINIMUM, _MAXIMUM))
 
 
+def attention_of(start: Array, action: Array) -> Array:
+    """The action (11,) with neck and focus as in `start` (11,)."""
+    held = action.copy()
+    held[NECK], held[FOCUS] = start[NECK], start[FOCUS]
+    return held
+
+
 def targets_of_action(action: Array) -> JointTargets:
     """Joint targets for an action (11,); the grasp level moves all nine hand motors together."""
     return JointTargets(

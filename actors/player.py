@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.attention import clip_action, crop_of_focus, targets_of_action
+from actors.attention import attention_of, clip_action, crop_of_focus, targets_of_action
 from actors.policy import Policy
 from actors.simulator import Simulator
 from actors.tasks.task import Situation, Task
@@ -64,7 +64,7 @@ def play(
     focus = float(task.start[FOCUS])
     for step, phase in enumerate(task.phases):
         seen = simulator.observe(crop_of_focus(focus))
-        action = clip_action(policy.step(seen.image))
+        action = _told(task, clip_action(policy.step(seen.image)))
         poses.append(simulator.bodies().rows)
         if on_step is not None:
             on_step(LiveStep(step, int(phase), seen.image, seen.joints_deg, action))
@@ -72,7 +72,7 @@ def play(
         judge.watch(report, simulator.joints_deg(), simulator.bodies())
         images.append(seen.image)
         actions.append(action)
-        targets.append(action if policy.target is None else policy.target)
+        targets.append(action if policy.target is None else _told(task, policy.target))
         joints.append(seen.joints_deg)
         if policy.outputs is not None:
             outputs.append(policy.outputs)
@@ -99,3 +99,8 @@ def play(
         outputs=np.asarray(outputs, dtype=np.float32) if outputs else None,
         control_period_s=simulator.control_period_s,
     )
+
+
+def _told(task: Task, action: Array) -> Array:
+    """The action as far as the task leaves it to the policy."""
+    return action if task.attention == "active" else attention_of(task.start, action)

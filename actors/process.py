@@ -104,7 +104,7 @@ class ActorProcess:
         self._lifecycle = lifecycle
         self._digest = config.digest()
         self._task = make_task(config.task)
-        self._tasks = {name: make() for name, make in TASKS.items()}
+        self._tasks = {name: make(config.task.attention) for name, make in TASKS.items()}
         self._simulator = make_simulator(config.simulator)
         outbox = config.run_folder / "outbox" / bus.id
         self._sequences = Outbox(outbox / "sequences", bus.deliver_wire)

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from actors.attention import targets_of_action
 from actors.simulator import Box, Pose, Scene, StepReport
 from actors.tasks.task import Situation
+from proto.config import Attention
 from proto.episode import Outcome, Reason
 from proto.errors import UserError
 from sim_assets.hand import GRASP_AXIS, GRASP_CENTRE_M, closing_fraction
@@ -90,12 +91,16 @@ class Experiment1:
 
     Attributes:
         grid: the tutored values of what makes a situation, by name.
+        attention: whether the head turns and the eye focuses.
     """
 
     name = "experiment1"
     grid: ClassVar[Mapping[str, tuple[float, ...]]] = GRID
     phases = np.repeat(np.arange(1, 9, dtype=np.uint8), list(SUBTASKS.values()))
     start = START
+
+    def __init__(self, attention: Attention = "active") -> None:
+        self.attention = attention
 
     def tutored(self) -> tuple[Situation, ...]:
         """The cases of the grid; the paper's 45."""

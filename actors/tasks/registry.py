@@ -12,4 +12,4 @@ TASKS = {task.name: task for task in (Experiment1, Reaching)}
 
 def make_task(config: TaskConfig) -> Task:
     """Make the task that the configuration names."""
-    return TASKS[config.name]()
+    return TASKS[config.name](config.attention)

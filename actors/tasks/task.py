@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.simulator import Pose, Scene, StepReport
+from proto.config import Attention
 from proto.episode import Outcome
 
 Situation = Mapping[str, float]
@@ -34,11 +35,13 @@ class Task(Protocol):
         name: what it is called in configs and files.
         phases: (T,) uint8, subtask of each control step, counted from 1 as in the paper.
         start: (11,) action whose posture every episode starts from.
+        attention: if fixed, neck and focus stay as in `start`, whatever the policy says.
     """
 
     name: str
     phases: NDArray[np.uint8]
     start: NDArray[np.float64]
+    attention: Attention
 
     def tutored(self) -> Sequence[Situation]:
         """The situations that are tutored, always in the same order."""

@@ -10,6 +10,7 @@ from actors.policies import make_policy, make_tutor
 from actors.simulator import make_simulator
 from actors.tasks.experiment1 import Experiment1
 from actors.tasks.reaching import Reaching
+from proto.action import ARM, FOCUS, GRASP, NECK
 from proto.config import Config, SimulatorConfig
 from proto.episode import Kind, Reason
 from proto.errors import UserError
@@ -129,3 +130,17 @@ def test_an_unknown_backend_lists_the_ones_there_are():
     for name in ("sapiens", "no.such.module:Simulator", "actors.player:Nothing"):
         with pytest.raises(UserError, match="sapien"):
             make_simulator(SimulatorConfig(backend=name))
+
+
+def test_with_attention_fixed_the_tutor_neither_turns_its_head_nor_focuses(physics):
+    fixed, case = Experiment1("fixed"), TASK.tutored()[3]
+    noisy = make_tutor(Config(), noisy=True)
+    still = play(physics, fixed, noisy, case, seed=3001, kind=Kind.TUTORING)
+    moving = play(physics, TASK, noisy, case, seed=3001, kind=Kind.TUTORING)
+    held, free = np.r_[NECK, FOCUS], np.r_[ARM, GRASP]
+    for values in (still.actions, still.targets):
+        assert (values[:, held] == TASK.start[held]).all()
+    assert np.ptp(moving.targets[:, held], axis=0).min() > 1
+    np.testing.assert_array_equal(still.actions[:, free], moving.actions[:, free])
+    np.testing.assert_array_equal(still.targets[:, free], moving.targets[:, free])
+    assert np.ptp(still.joints_deg[:, NECK], axis=0).max() < 0.1
