@@ -7,7 +7,8 @@ import math
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from statistics import median
@@ -17,12 +18,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from learner.adam import Adam
 from learner.captured import CapturedUpdates
-from learner.divergence import divergence, reference_divergence
+from learner.divergence import add_gradients, divergence, reference_divergence
 from learner.kernels.library import peak_flops
 from learner.loss import kl_divergence
 from learner.mstnn import activation
-from learner.optimization import one_thread
 from learner.plain import Step, plain_divergence, plain_outputs, plain_step
 from learner.sequences import Sequences
 from learner.vmdnn import VMDNN
@@ -35,6 +36,7 @@ Epoch = Callable[[], object]
 MEASURING_S: Final = 12.0
 TURN_S: Final = 0.1
 LONG_S: Final = 2.0
+RATE: Final = 1e-4
 COMPILING_S: Final = 20.0
 """How long `torch.compile` may take, measuring included."""
 
@@ -112,10 +114,9 @@ def bench_bptt(
     sequences = _sequences(network, batch, steps)
     by_loop = functools.partial(plain_divergence, network, sequences)
     by_hand = functools.partial(reference_divergence, network, sequences)
-    fused = functools.partial(divergence, network, sequences)
     contenders = {
         "eager": _epoch(by_loop, network.core_parameters(), sequences),
-        "fused": _epoch(fused, network.core_parameters(), sequences, captured=where.type == "cuda"),
+        "fused": _fused_epoch(_network(config.network, where), sequences),
         "autograd by hand": _epoch(by_hand, network.core_parameters(), sequences),
         "nn.LSTM": _peer_epoch(_Lstm, network, sequences),
         "MTRNN cell": _peer_epoch(_Mtrnn, network, sequences),
@@ -173,6 +174,23 @@ def _sequences(network: VMDNN, batch: int, steps: int) -> Sequences:
     return Sequences.stacked(list(seen), list(codes)).to(network.pfc.input.device)
 
 
+def _fused_epoch(network: VMDNN, sequences: Sequences) -> Epoch:
+    """As training does it, if all sequences fit into one minibatch."""
+    parameters = network.core_parameters()
+    if network.pfc.input.is_cuda:
+        fused = functools.partial(divergence, network, sequences)
+        return _epoch(fused, parameters, sequences, captured=True)
+    adam = Adam(parameters)
+    everything = torch.arange(len(sequences.mask))
+
+    def epoch() -> float:
+        loss = add_gradients(network, sequences, everything)
+        adam.step(RATE)
+        return loss
+
+    return epoch
+
+
 def _epoch(
     loss: Callable[[Tensor], Tensor],
     parameters: Sequence[nn.Parameter],
@@ -180,20 +198,35 @@ def _epoch(
     *,
     captured: bool = False,
 ) -> Epoch:
-    """What training does in an epoch whose sequences fit into one minibatch."""
-    adam = torch.optim.Adam(parameters, 1e-4, fused=True, capturable=captured)
+    """The same by autograd and PyTorch's fused Adam."""
+    adam = torch.optim.Adam(parameters, RATE, fused=True, capturable=captured)
     everything = torch.arange(len(sequences.mask), device=sequences.mask.device)
 
     def update(chosen: Tensor) -> Tensor:
         adam.zero_grad()
         value = loss(chosen)
         value.backward()  # type: ignore[no-untyped-call]
-        with one_thread():
+        with _one_thread():
             adam.step()
         return value
 
     updates = CapturedUpdates(update) if captured else update
     return lambda: updates(everything).item()
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let PyTorch compute in one thread.
+
+    A step of Adam on so few weights takes less time than threads take to meet; where others use the
+    cores too, it is a thousand times as long.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _medians_ms(contenders: Mapping[str, Epoch], limit_s: float) -> dict[str, float]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from learner.divergence import divergence
+from learner.divergence import add_gradients
 from learner.interpolation import Neighbours
 from learner.sequences import Sequences
 from learner.softmax_code import SoftmaxCode
@@ -90,15 +90,15 @@ class CoupledTraining:
         self._situations.append(episode.situation)
         self._material = None
 
-    def loss(self, chosen: Tensor) -> Tensor:
-        """Mean divergence of eq. (5), for the sequences with these indices."""
+    def add_gradients(self, chosen: Tensor) -> float:
+        """Mean divergence of eq. (5), for the sequences with these indices; adds its gradients."""
         material = self._all()
         shift = self._wrongly(len(chosen), material.spread)
         sequences = material.sequences
         if self._config.interpolation:
             sequences = self._mixed(chosen, material)
             chosen = torch.arange(len(chosen))
-        return divergence(self._network, sequences, chosen, shift=shift)
+        return add_gradients(self._network, sequences, chosen, shift)
 
     def _all(self) -> _Material:
         """Everything taken in, side by side."""

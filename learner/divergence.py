@@ -38,6 +38,21 @@ def divergence(
     return reference_divergence(network, sequences, chosen, initial, shift)
 
 
+def add_gradients(
+    network: VMDNN, sequences: Sequences, chosen: Tensor, shift: Tensor | None = None
+) -> float:
+    """`divergence`; its gradients are added to the `grad` of the coupled parameters.
+
+    The same as calling `backward` on it, but faster: for so small a network, recording what is to
+    be differentiated takes a tenth of the time.
+    """
+    if cpu.serves(sequences):
+        return cpu.add_gradients(network, sequences, chosen, shift)
+    loss = reference_divergence(network, sequences, chosen, shift=shift)
+    loss.backward()  # type: ignore[no-untyped-call]
+    return loss.item()
+
+
 def reference_divergence(
     network: VMDNN,
     sequences: Sequences,

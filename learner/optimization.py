@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final, Literal, Protocol
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor, nn
 
+from learner.adam import Adam
 from proto.episode import Episode
 from proto.errors import UserError
-
-_ADAM_STATE: Final = ("step", "exp_avg", "exp_avg_sq")
 
 
 class Lesson(Protocol):
@@ -28,8 +26,11 @@ class Lesson(Protocol):
     def add(self, episode: Episode) -> None:
         """Take a sequence in."""
 
-    def loss(self, chosen: Tensor) -> Tensor:
-        """Mean loss of the sequences with these indices, differentiable by the parameters."""
+    def add_gradients(self, chosen: Tensor) -> float:
+        """Mean loss of the sequences with these indices.
+
+        Its gradients are added to the parameters' `grad`, as `backward` adds them.
+        """
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Optimization:
     def __init__(self, lesson: Lesson, plan: Plan) -> None:
         self._lesson = lesson
         self._plan = plan
-        self._adam = torch.optim.Adam(lesson.parameters, plan.rate, fused=True)
+        self._adam = Adam(lesson.parameters, plan.clip_norm)
 
     def epoch(self, number: int, generator: torch.Generator) -> float:
         """Show every sequence once, in minibatches of nearly equal size; the mean loss.
@@ -73,64 +74,34 @@ class Optimization:
         Raises:
             UserError: the training diverged.
         """
-        for group in self._adam.param_groups:
-            group["lr"] = self._plan.rate_at(number)
-        total = sum(self._update(chosen) * len(chosen) for chosen in self._minibatches(generator))
+        rate = self._plan.rate_at(number)
+        minibatches = self._minibatches(generator)
+        total = sum(self._update(chosen, rate) * len(chosen) for chosen in minibatches)
         return total / len(self._lesson)
 
     def tensors(self) -> dict[str, Tensor]:
         """The state of Adam, by parameter and name."""
-        state = self._adam.state_dict()["state"]
-        return {
-            f"{index}.{name}": values[name]
-            for index, values in state.items()
-            for name in _ADAM_STATE
-        }
+        return self._adam.tensors()
 
-    def load_tensors(self, tensors: dict[str, Tensor]) -> None:
+    def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
         """Take the state that `tensors` gave.
 
         Raises:
             KeyError: a part of it is missing.
         """
-        state = {
-            index: {name: tensors[f"{index}.{name}"] for name in _ADAM_STATE}
-            for index in range(len(self._lesson.parameters))
-        }
-        self._adam.load_state_dict({**self._adam.state_dict(), "state": state})
+        self._adam.load_tensors(tensors)
 
     def _minibatches(self, generator: torch.Generator) -> Iterator[Tensor]:
         count = len(self._lesson)
         shuffled = torch.randperm(count, generator=generator)
         return iter(shuffled.tensor_split(math.ceil(count / self._plan.batch)))
 
-    def _update(self, chosen: Tensor) -> float:
-        loss = self._lesson.loss(chosen)
-        self._adam.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        if self._plan.clip_norm is not None:
-            nn.utils.clip_grad_norm_(self._lesson.parameters, self._plan.clip_norm)
-        value = loss.item()
-        if not math.isfinite(value):
+    def _update(self, chosen: Tensor, rate: float) -> float:
+        loss = self._lesson.add_gradients(chosen)
+        if not math.isfinite(loss):
             raise UserError(
-                f"the training diverged (loss {value}): lower learner.rate or learner.clip_norm,"
+                f"the training diverged (loss {loss}): lower learner.rate or learner.clip_norm,"
                 " and go on from the last checkpoint or start again"
             )
-        with one_thread():
-            self._adam.step()
-        return value
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let PyTorch compute in one thread.
-
-    A step of Adam on so few weights takes less time than threads take to meet; where others use the
-    cores too, it is a thousand times as long.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+        self._adam.step(rate)
+        return loss

@@ -88,6 +88,12 @@ class Pretraining:
         self._labels.append(np.concatenate(labels))
         self._images.append(episode.images)
 
+    def add_gradients(self, chosen: Tensor) -> float:
+        """`loss`; its gradients are added to the parameters' `grad`."""
+        loss = self.loss(chosen)
+        loss.backward()  # type: ignore[no-untyped-call]
+        return loss.item()
+
     def loss(self, chosen: Tensor) -> Tensor:
         """Mean divergence of the answers to the labels, for the sequences with these indices."""
         indices = chosen.tolist()

@@ -149,14 +149,14 @@ struct Problem {
   const Real* target_entropies;  // (S, T) sum of targets * log(targets)
   const Real* mask;              // (S, T)
   const Real* initial;           // (B, all units) potentials before the first step; null: zero
-  const Real* shift;             // (B, units of the PFC) added to what V_S brings there, or null
+  const Real* shift;             // (B, inputs) added to what is seen at every step, or null
   // Of each level: input, recurrent, feedback (but the last), bias; of the outputs: input, bias.
-  const Real* parameters;
+  const Real* const* parameters;
   double* divergence;
-  Real* by_parameters;  // null: only the divergence is asked for
-  Real* by_drive;       // (B, T, units of the PFC) by what V_S brings to the PFC, or null
-  Real* by_initial;     // (B, all units), or null
-  Real* by_shift;       // (B, units of the PFC), or null
+  Real* const* by_parameters;  // is added to; null: only the divergence is asked for
+  Real* by_drive;              // (B, T, units of the PFC) by what V_S brings to the PFC, or null
+  Real* by_initial;            // (B, all units), or null
+  Real* by_shift;              // (B, units of the PFC) by what the shift brings there, or null
 };
 
 struct Level {
@@ -200,12 +200,12 @@ template <typename Real>
 struct Connection {
   int to;
   int from;
-  bool delayed;               // whether it takes a step
-  std::ptrdiff_t parameters;  // where its (to.units, from.units) weights lie among all parameters
-  std::ptrdiff_t sums;        // where its gradient lies among a group's sums, with padded sizes
-  Real scale;                 // packed over given weights
-  Real* forward;              // packed, rows `to`
-  Real* backward;             // packed, rows `from`
+  bool delayed;         // whether it takes a step
+  int parameter;        // which of the parameters its (to.units, from.units) weights are
+  std::ptrdiff_t sums;  // where its gradient lies among a group's sums, with padded sizes
+  Real scale;           // packed over given weights
+  Real* forward;        // packed, rows `to`
+  Real* backward;       // packed, rows `from`
 };
 
 enum Stage { kProject, kForward, kOutputs, kBackward, kInputs, kDone };
@@ -265,7 +265,7 @@ class Pass {
   }
 
   void describe();
-  void connect(int to, int from, bool delayed, std::ptrdiff_t& next);
+  void connect(int to, int from, bool delayed, int parameter);
   void form_groups();
   void take_memory(Arena& arena);
   void pack_weights();
@@ -277,7 +277,7 @@ class Pass {
   bool claim(Task& task);
   void finish(const Task& task);
   void project(const Group& group, int chunk, const Scratch& scratch) const;
-  void gather_shift(const Group& group, Vec* shift) const;
+  void project_shift(const Group& group, const Scratch& scratch, Vec* drive) const;
   void scan_forward(Group& group, const Scratch& scratch) const;
   void start_rows(Group& group, Vec* potentials) const;
   void outputs(const Group& group, int chunk, const Scratch& scratch) const;
@@ -288,7 +288,11 @@ class Pass {
   void give_initial(const Group& group) const;
   void give_drive(const Group& group) const;
   void give_shift(const Group& group) const;
+  Vec total_delta(const Group& group, int unit) const;
   void inputs(const Group& group, int chunk, const Scratch& scratch) const;
+  void add_shift_gradients(const Group& group, const Scratch& scratch, Real* sums) const;
+  void add_input_gradients(const Real* deltas, const Real* seen, int steps, const Real* soon,
+                           Real* sums) const;
   void add_up() const;
 
   const Problem<Real>& problem_;
@@ -297,12 +301,12 @@ class Pass {
   int width_ = 0;      // units of all levels, padded
   int units_ = 0;      // units of all levels
   std::vector<Level> levels_;
-  std::vector<std::ptrdiff_t> biases_;         // of the levels, among all parameters
+  std::vector<int> biases_;                    // of the levels: which of the parameters
   std::vector<Connection<Real>> connections_;  // between levels
   Connection<Real> to_outputs_{};
-  std::ptrdiff_t output_bias_ = 0;  // among all parameters
-  std::ptrdiff_t group_sums_ = 0;   // gradients of the connections, then of the levels' biases
-  double weight_ = 0;               // of one value of one step in the mean
+  int output_bias_ = 0;            // which of the parameters
+  std::ptrdiff_t group_sums_ = 0;  // gradients of the connections, then of the levels' biases
+  double weight_ = 0;              // of one value of one step in the mean
   std::vector<Group> groups_;
   std::vector<Scratch> scratch_;
   Real* packed_bias_ = nullptr;         // (width,)
@@ -337,38 +341,29 @@ void Pass<Real>::describe() {
     width_ += levels_.back().padded;
     units_ += units;
   }
-  std::ptrdiff_t next = 0;  // among the parameters
+  int next = 1;  // of the parameters; the first are the weights from V_S
   for (int l = 0; l <= last; ++l) {
-    const int units = levels_[l].units;
-    if (l == 0) {
-      next += std::ptrdiff_t(units) * problem_.inputs;
-    } else {
-      connect(l, l - 1, problem_.literal != 0, next);
-    }
-    connect(l, l, true, next);
-    if (l < last) connect(l, l + 1, true, next);
-    biases_.push_back(next);
-    next += units;
+    if (l > 0) connect(l, l - 1, problem_.literal != 0, next++);
+    connect(l, l, true, next++);
+    if (l < last) connect(l, l + 1, true, next++);
+    biases_.push_back(next++);
   }
-  const std::ptrdiff_t outputs = problem_.values * problem_.softmax_units;
-  to_outputs_.parameters = next;
+  to_outputs_.parameter = next++;
   to_outputs_.scale = Real(kGain);
-  output_bias_ = next + outputs * levels_[last].units;
+  output_bias_ = next;
   group_sums_ += width_;
 }
 
-// Counts the connection's weights, which begin at `next` among the parameters.
 template <typename Real>
-void Pass<Real>::connect(int to, int from, bool delayed, std::ptrdiff_t& next) {
+void Pass<Real>::connect(int to, int from, bool delayed, int parameter) {
   Connection<Real> connection{};
   connection.to = to;
   connection.from = from;
   connection.delayed = delayed;
-  connection.parameters = next;
+  connection.parameter = parameter;
   connection.scale = Real(kGain * levels_[to].scale);
   connection.sums = group_sums_;
   connections_.push_back(connection);
-  next += std::ptrdiff_t(levels_[to].units) * levels_[from].units;
   group_sums_ += std::ptrdiff_t(levels_[to].padded) * levels_[from].padded;
 }
 
@@ -446,24 +441,25 @@ void Pass<Real>::pack_weights() {
   const int outputs = problem_.values * problem_.softmax_units;
   pack_connection(to_outputs_, outputs, outputs_, levels_.back());
   for (std::size_t l = 0; l < levels_.size(); ++l) {
-    const Real* bias = problem_.parameters + biases_[l];
+    const Real* bias = problem_.parameters[biases_[l]];
     for (int i = 0; i < levels_[l].padded; ++i) {
       packed_bias_[levels_[l].start + i] =
           i < levels_[l].units ? Real(levels_[l].scale) * bias[i] : Real(0);
     }
   }
+  const Real* bias = problem_.parameters[output_bias_];
   for (int i = 0; i < outputs_; ++i) {
-    packed_output_bias_[i] = i < outputs ? problem_.parameters[output_bias_ + i] : Real(0);
+    packed_output_bias_[i] = i < outputs ? bias[i] : Real(0);
   }
   const Level& first = levels_.front();
-  pack(packed_inputs_, problem_.parameters, problem_.inputs, 1, first.units, problem_.inputs,
+  pack(packed_inputs_, problem_.parameters[0], problem_.inputs, 1, first.units, problem_.inputs,
        problem_.inputs, Real(first.scale));
 }
 
 template <typename Real>
 void Pass<Real>::pack_connection(Connection<Real>& connection, int to, int to_padded,
                                  const Level& from) {
-  const Real* weights = problem_.parameters + connection.parameters;
+  const Real* weights = problem_.parameters[connection.parameter];
   pack(connection.forward, weights, from.units, 1, to, from.units, from.padded, connection.scale);
   pack(connection.backward, weights, 1, from.units, from.units, to, to_padded, connection.scale);
 }
@@ -540,7 +536,7 @@ void Pass<Real>::project(const Group& group, int chunk, const Scratch& scratch) 
   const Level& pfc = levels_.front();
   const int end = std::min((chunk + 1) * kChunk, group.steps);
   Vec* shift = scratch.potentials;
-  gather_shift(group, shift);
+  project_shift(group, scratch, shift);
   for (int t = chunk * kChunk; t < end; ++t) {
     Vec* drive = group.hidden + std::ptrdiff_t(t + 1) * width_;
     const bool sees = t >= lag_;
@@ -564,14 +560,24 @@ void Pass<Real>::project(const Group& group, int chunk, const Scratch& scratch) 
   }
 }
 
+// What the PFC gets from the shift of V_S, at every step.
 template <typename Real>
-void Pass<Real>::gather_shift(const Group& group, Vec* shift) const {
+void Pass<Real>::project_shift(const Group& group, const Scratch& scratch, Vec* drive) const {
   const Level& pfc = levels_.front();
-  std::fill(shift, shift + pfc.padded, Vec{});
-  if (problem_.shift == nullptr) return;
+  if (problem_.shift == nullptr) {
+    std::fill(drive, drive + pfc.padded, Vec{});
+    return;
+  }
+  const Real* arrays[kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
-    const Real* given = problem_.shift + std::ptrdiff_t(group.member[lane]) * pfc.units;
-    for (int i = 0; i < pfc.units; ++i) shift[i][lane] = Real(pfc.scale) * given[i];
+    arrays[lane] = problem_.shift + std::ptrdiff_t(group.member[lane]) * problem_.inputs;
+  }
+  gather(arrays, problem_.inputs, scratch.inputs);
+  for (int tile = 0; tile < pfc.padded; tile += kTile) {
+    Vec sums[kTile] = {};
+    add_product<Real>(packed_inputs_ + std::ptrdiff_t(tile) * problem_.inputs, problem_.inputs,
+                      scratch.inputs, sums);
+    for (int i = 0; i < kTile; ++i) drive[tile + i] = sums[i];
   }
 }
 
@@ -811,15 +817,23 @@ template <typename Real>
 void Pass<Real>::give_shift(const Group& group) const {
   const Level& pfc = levels_.front();
   for (int i = 0; i < pfc.units; ++i) {
-    Vec total{};
-    for (int row = 1 + lag_; row <= group.steps; ++row) {
-      total += group.deltas[std::ptrdiff_t(row) * width_ + pfc.start + i];
-    }
+    const Vec total = total_delta(group, i);
     for (int lane = 0; lane < group.members; ++lane) {
       problem_.by_shift[std::ptrdiff_t(group.member[lane]) * pfc.units + i] =
           Real(pfc.scale) * total[lane];
     }
   }
+}
+
+// The sum of the deltas of a unit of the PFC, over all steps that see something.
+template <typename Real>
+Vector<Real> Pass<Real>::total_delta(const Group& group, int unit) const {
+  const Vec* deltas = group.deltas + levels_.front().start + unit;
+  Vec total{};
+  for (int row = 1 + lag_; row <= group.steps; ++row) {
+    total += deltas[std::ptrdiff_t(row) * width_];
+  }
+  return total;
 }
 
 // The gradient of the weights from V_S, whose activity is read as it lies: units side by side.
@@ -841,34 +855,59 @@ void Pass<Real>::inputs(const Group& group, int chunk, const Scratch& scratch) c
   Real* sums = group.input_sums + chunk * input_sums();
   std::fill(sums, sums + input_sums(), Real(0));
   for (int lane = 0; lane < group.members; ++lane) {
-    const Real* deltas = scratch.rows + std::ptrdiff_t(lane) * kChunk * pitch;
-    const Real* seen = problem_.seen + (group.row[lane] + begin - lag_) * units;
     const int later = std::min(lane + 1, kLanes - 1);
-    const Real* soon = problem_.seen + (group.row[later] + begin - lag_) * units;
-    int f = 0;
-    for (; f + kWide * kLanes <= units; f += kWide * kLanes) {
-      for (int t = 0; t < count; ++t) {
-        for (int v = 0; v < kWide; ++v) {
-          __builtin_prefetch(soon + std::ptrdiff_t(t) * units + f + v * kLanes, 0, 2);
-        }
-      }
-      for (int i = 0; i < pfc.padded; i += kSide) {
-        add_rank_products<Real, kWide>(deltas + i, pitch, seen + f, units, count,
-                                       sums + std::ptrdiff_t(i) * units + f);
+    add_input_gradients(scratch.rows + std::ptrdiff_t(lane) * kChunk * pitch,
+                        problem_.seen + (group.row[lane] + begin - lag_) * units, count,
+                        problem_.seen + (group.row[later] + begin - lag_) * units, sums);
+  }
+  if (chunk == 0 && problem_.shift != nullptr) add_shift_gradients(group, scratch, sums);
+}
+
+// What the shift adds to that: it is seen at every step, so that the sums of the deltas will do.
+template <typename Real>
+void Pass<Real>::add_shift_gradients(const Group& group, const Scratch& scratch,
+                                     Real* sums) const {
+  const int pitch = levels_.front().padded;
+  Real* arrays[kLanes];
+  for (int lane = 0; lane < kLanes; ++lane) arrays[lane] = scratch.rows + lane * pitch;
+  for (int i = 0; i < pitch; ++i) scratch.potentials[i] = total_delta(group, i);
+  scatter(scratch.potentials, pitch, arrays, group.members);
+  for (int lane = 0; lane < group.members; ++lane) {
+    const Real* shift = problem_.shift + std::ptrdiff_t(group.member[lane]) * problem_.inputs;
+    add_input_gradients(arrays[lane], shift, 1, shift, sums);
+  }
+}
+
+// sums[i][f] += sum over some steps of one sequence of deltas[step][i] seen[step][f]; fetches what
+// is seen `soon`.
+template <typename Real>
+void Pass<Real>::add_input_gradients(const Real* deltas, const Real* seen, int steps,
+                                     const Real* soon, Real* sums) const {
+  const int rows = levels_.front().padded;
+  const int units = problem_.inputs;
+  int f = 0;
+  for (; f + kWide * kLanes <= units; f += kWide * kLanes) {
+    for (int t = 0; t < steps; ++t) {
+      for (int v = 0; v < kWide; ++v) {
+        __builtin_prefetch(soon + std::ptrdiff_t(t) * units + f + v * kLanes, 0, 2);
       }
     }
-    for (; f + kLanes <= units; f += kLanes) {
-      for (int i = 0; i < pfc.padded; i += kSide) {
-        add_rank_products<Real, 1>(deltas + i, pitch, seen + f, units, count,
-                                   sums + std::ptrdiff_t(i) * units + f);
-      }
+    for (int i = 0; i < rows; i += kSide) {
+      add_rank_products<Real, kWide>(deltas + i, rows, seen + f, units, steps,
+                                     sums + std::ptrdiff_t(i) * units + f);
     }
-    for (; f < units; ++f) {
-      for (int i = 0; i < pfc.padded; ++i) {
-        for (int t = 0; t < count; ++t) {
-          sums[std::ptrdiff_t(i) * units + f] +=
-              deltas[std::ptrdiff_t(t) * pitch + i] * seen[std::ptrdiff_t(t) * units + f];
-        }
+  }
+  for (; f + kLanes <= units; f += kLanes) {
+    for (int i = 0; i < rows; i += kSide) {
+      add_rank_products<Real, 1>(deltas + i, rows, seen + f, units, steps,
+                                 sums + std::ptrdiff_t(i) * units + f);
+    }
+  }
+  for (; f < units; ++f) {
+    for (int i = 0; i < rows; ++i) {
+      for (int t = 0; t < steps; ++t) {
+        sums[std::ptrdiff_t(i) * units + f] +=
+            deltas[std::ptrdiff_t(t) * rows + i] * seen[std::ptrdiff_t(t) * units + f];
       }
     }
   }
@@ -885,31 +924,30 @@ void Pass<Real>::add_up() const {
   }
   *problem_.divergence = divergence * weight_;
   if (!wants_gradients()) return;
-  Real* gradients = problem_.by_parameters;
+  Real* const* gradients = problem_.by_parameters;
   const Level& pfc = levels_.front();
   const Level& fast = levels_.back();
   const int outputs = problem_.values * problem_.softmax_units;
-  std::fill(gradients, gradients + output_bias_ + outputs, Real(0));
   for (const Group& group : groups_) {
     for (const Connection<Real>& connection : connections_) {
       const Level& to = levels_[connection.to];
       const Level& from = levels_[connection.from];
       add_scaled(group.sums + connection.sums, from.padded, to.units, from.units,
-                 connection.scale, gradients + connection.parameters);
+                 connection.scale, gradients[connection.parameter]);
     }
     const Real* by_biases = group.sums + group_sums_ - width_;
     for (std::size_t l = 0; l < levels_.size(); ++l) {
       add_scaled(by_biases + levels_[l].start, 0, 1, levels_[l].units, Real(levels_[l].scale),
-                 gradients + biases_[l]);
+                 gradients[biases_[l]]);
     }
     for (int chunk = 0; chunk < chunks(group); ++chunk) {
       const Real* sums = group.output_sums + chunk * output_sums();
       add_scaled(sums, fast.padded, outputs, fast.units, to_outputs_.scale,
-                 gradients + to_outputs_.parameters);
+                 gradients[to_outputs_.parameter]);
       add_scaled(sums + std::ptrdiff_t(outputs_) * fast.padded, 0, 1, outputs, Real(1),
-                 gradients + output_bias_);
+                 gradients[output_bias_]);
       add_scaled(group.input_sums + chunk * input_sums(), problem_.inputs, pfc.units,
-                 problem_.inputs, Real(pfc.scale), gradients);
+                 problem_.inputs, Real(pfc.scale), gradients[0]);
     }
   }
 }

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Final, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx
 
 from learner.kernels.library import learning_library
@@ -63,10 +63,7 @@ def divergence(
     shift: Tensor | None = None,
 ) -> Tensor:
     """`learner.divergence.divergence`, computed by the kernel."""
-    # The kernel reads what was seen where it lies; that all of it is shifted it learns in the PFC.
-    drive_shift = None if shift is None else shift @ network.pfc.input.T
-    parameters = torch.cat([each.view(-1) for each in network.core_parameters()])
-    differentiable = (initial, drive_shift, sequences.seen, parameters)
+    differentiable = (initial, shift, sequences.seen, *network.core_parameters())
     wanted = [
         torch.is_grad_enabled() and each is not None and each.requires_grad
         for each in differentiable
@@ -77,14 +74,37 @@ def divergence(
     return cast("Tensor", result)
 
 
+def add_gradients(
+    network: VMDNN, sequences: Sequences, chosen: Tensor, shift: Tensor | None = None
+) -> float:
+    """`learner.divergence.add_gradients`, computed by the kernel."""
+    parameters = network.core_parameters()
+    gradients = _Gradients(by_parameters=[_gradient_of(each) for each in parameters])
+    return _call(network, sequences, chosen, None, shift, parameters, gradients)
+
+
+def _gradient_of(parameter: nn.Parameter) -> Tensor:
+    if parameter.grad is None:
+        parameter.grad = torch.zeros_like(parameter)
+    return parameter.grad
+
+
 @dataclass(frozen=True)
 class _Gradients:
-    """What one call of the kernel leaves; None for what was not asked for."""
+    """Where a call of the kernel leaves gradients; None for what is not asked for.
 
-    by_parameters: Tensor | None
-    by_drive: Tensor | None
-    by_initial: Tensor | None
-    by_shift: Tensor | None
+    Attributes:
+        by_parameters: in the order of `VMDNN.core_parameters`; is added to. Must be there if
+            any other is.
+        by_drive: (B, T, units of the PFC) by what V_S brings there.
+        by_initial: (B, units of all levels).
+        by_shift: (B, units of the PFC) by what the shift of V_S brings there.
+    """
+
+    by_parameters: Sequence[Tensor] | None = None
+    by_drive: Tensor | None = None
+    by_initial: Tensor | None = None
+    by_shift: Tensor | None = None
 
 
 class _Divergence(torch.autograd.Function):
@@ -100,11 +120,20 @@ class _Divergence(torch.autograd.Function):
         initial: Tensor | None,
         shift: Tensor | None,
         seen: Tensor,
-        parameters: Tensor,
+        *parameters: Tensor,
     ) -> Tensor:
-        loss, gradients = _call(network, sequences, chosen, initial, shift, parameters, wanted)
+        units = [level.units for level in network.levels()]
+        count, steps = len(chosen), seen.shape[1]
+        by_initial, by_shift, by_seen, *_ = wanted
+        gradients = _Gradients(
+            [torch.zeros_like(each) for each in parameters] if any(wanted) else None,
+            seen.new_empty(count, steps, units[0]) if by_seen else None,
+            seen.new_empty(count, sum(units)) if by_initial else None,
+            seen.new_empty(count, units[0]) if by_shift else None,
+        )
+        loss = _call(network, sequences, chosen, initial, shift, parameters, gradients)
         ctx.gradients, ctx.chosen, ctx.seen_shape = gradients, chosen, seen.shape  # type: ignore[attr-defined]
-        ctx.save_for_backward(parameters)
+        ctx.save_for_backward(network.pfc.input)
         return seen.new_tensor(loss)
 
     @staticmethod
@@ -115,21 +144,18 @@ class _Divergence(torch.autograd.Function):
                 " does not work on it; differentiate learner.divergence.reference_divergence"
             )
         (by_loss,) = by_outputs
+        (pfc_input,) = ctx.saved_tensors
         gradients: _Gradients = ctx.gradients
-        by_seen = None
+        by_initial, by_shift, by_seen = gradients.by_initial, gradients.by_shift, None
+        if by_initial is not None:
+            by_initial = by_initial * by_loss
+        if by_shift is not None:
+            by_shift = (by_shift * by_loss) @ pfc_input
         if gradients.by_drive is not None:
-            (parameters,) = ctx.saved_tensors
-            units, inputs = gradients.by_drive.shape[2], ctx.seen_shape[2]
-            by_chosen = (gradients.by_drive * by_loss) @ parameters[: units * inputs].view(
-                units, -1
-            )
+            by_chosen = (gradients.by_drive * by_loss) @ pfc_input
             by_seen = by_chosen.new_zeros(ctx.seen_shape).index_add_(0, ctx.chosen, by_chosen)
-        by_others = (
-            None if each is None else each * by_loss
-            for each in (gradients.by_initial, gradients.by_shift, gradients.by_parameters)
-        )
-        by_initial, by_shift, by_parameters = by_others
-        return (None, None, None, None, by_initial, by_shift, by_seen, by_parameters)
+        by_parameters = (each * by_loss for each in gradients.by_parameters or ())
+        return (None, None, None, None, by_initial, by_shift, by_seen, *by_parameters)
 
 
 def _call(
@@ -138,9 +164,10 @@ def _call(
     chosen: Tensor,
     initial: Tensor | None,
     shift: Tensor | None,
-    parameters: Tensor,
-    wanted: Sequence[bool],
-) -> tuple[float, _Gradients]:
+    parameters: Sequence[Tensor],
+    gradients: _Gradients,
+) -> float:
+    """The loss, by the kernel, which leaves the gradients."""
     seen, codes = sequences.seen.contiguous(), sequences.codes.contiguous()
     mask, entropies = sequences.mask.contiguous(), sequences.code_entropies.contiguous()
     levels = network.levels()
@@ -149,16 +176,11 @@ def _call(
     chosen = chosen.contiguous()
     initial = None if initial is None else initial.contiguous()
     shift = None if shift is None else shift.contiguous()
-    by_initial, by_shift, by_seen, *_ = wanted
-    gradients = _Gradients(
-        torch.empty_like(parameters) if any(wanted) else None,
-        seen.new_empty(len(chosen), seen.shape[1], units[0]) if by_seen else None,
-        seen.new_empty(len(chosen), sum(units)) if by_initial else None,
-        seen.new_empty(len(chosen), units[0]) if by_shift else None,
-    )
     loss = ctypes.c_double()
     c_units = (ctypes.c_int32 * len(units))(*units)
     c_leaks = (ctypes.c_double * len(units))(*(1 / level.tau for level in levels))
+    c_parameters = _addresses(parameters)
+    c_by_parameters = _addresses(gradients.by_parameters or ())
     problem = _Problem(
         levels=len(units),
         inputs=seen.shape[2],
@@ -177,16 +199,16 @@ def _call(
         mask=mask.data_ptr(),
         initial=_address(initial),
         shift=_address(shift),
-        parameters=parameters.data_ptr(),
+        parameters=ctypes.addressof(c_parameters),
         divergence=ctypes.addressof(loss),
-        by_parameters=_address(gradients.by_parameters),
+        by_parameters=ctypes.addressof(c_by_parameters) if gradients.by_parameters else None,
         by_drive=_address(gradients.by_drive),
         by_initial=_address(gradients.by_initial),
         by_shift=_address(gradients.by_shift),
     )
     if _functions()[seen.dtype](ctypes.byref(problem)) != 0:
         raise MemoryError(f"the recurrent core has no memory for {len(chosen)} sequences")
-    return loss.value, gradients
+    return loss.value
 
 
 def _check(
@@ -209,7 +231,7 @@ def _check(
         units = sum(level.units for level in network.levels())
         expected["initial"] = (initial, (len(chosen), units))
     if shift is not None:
-        expected["shift, in the PFC,"] = (shift, (len(chosen), network.pfc.units))
+        expected["shift"] = (shift, (len(chosen), like.shape[1]))
     for name, (tensor, shape) in expected.items():
         if tensor.shape != shape or tensor.dtype != like.dtype:
             raise ValueError(
@@ -218,12 +240,19 @@ def _check(
             )
     if chosen.dtype != torch.int64 or len(chosen) == 0:
         raise ValueError(f"chosen is {len(chosen)} {chosen.dtype}, but must be some int64")
-    if not 0 <= int(chosen.min()) <= int(chosen.max()) < count:
-        raise IndexError(f"chosen is {chosen.tolist()}, but there are {count} sequences")
+    indices = chosen.tolist()
+    if not 0 <= min(indices) <= max(indices) < count:
+        raise IndexError(f"chosen is {indices}, but there are {count} sequences")
 
 
 def _address(tensor: Tensor | None) -> int | None:
     return None if tensor is None else tensor.data_ptr()
+
+
+def _addresses(tensors: Sequence[Tensor]) -> ctypes.Array[ctypes.c_void_p]:
+    if not all(tensor.is_contiguous() for tensor in tensors):
+        raise ValueError("a parameter or its gradient is not contiguous")
+    return (ctypes.c_void_p * len(tensors))(*(tensor.data_ptr() for tensor in tensors))
 
 
 @functools.cache

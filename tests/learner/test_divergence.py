@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from learner.divergence import divergence, reference_divergence
+from learner.divergence import add_gradients, divergence, reference_divergence
 from learner.kernels import cpu
 from learner.kernels.build import NotCompiledError, find_or_compile
 from learner.kernels.library import learning_library
@@ -157,6 +157,24 @@ def test_paper_network_in_single_precision(order: str) -> None:
 
 
 @pytest.mark.usefixtures("_compiled")
+@pytest.mark.parametrize("order", ["bottom_up", "literal"])
+@pytest.mark.parametrize("shifted", [True, False])
+def test_gradients_are_added_as_backward_adds_them(order: str, shifted: bool) -> None:
+    network = network_of(NetworkConfig.model_validate({"update_order": order}))
+    sequences, chosen = sequences_for(network, [1, 40, 33, 7] * 5), torch.randperm(20)[:18]
+    shift = torch.randn(18, sequences.seen.shape[2], dtype=DOUBLE) if shifted else None
+    parameters = network.core_parameters()
+    for _ in range(2):
+        loss = plain_divergence(network, sequences, chosen, None, shift)
+        loss.backward()
+    expected = [parameter.grad for parameter in parameters]
+    network.zero_grad()
+    for _ in range(2):
+        assert add_gradients(network, sequences, chosen, shift) == pytest.approx(loss.item())
+    assert_alike([p.grad for p in parameters], expected, 1e-10)
+
+
+@pytest.mark.usefixtures("_compiled")
 def test_small_activity_keeps_its_digits() -> None:
     """The paper's initial range leaves activities of 1e-4, which count as much as large ones."""
     network = network_of(NetworkConfig(), limit=1e-3)
@@ -252,6 +270,7 @@ def test_without_a_compiler_pytorch_computes_it(
         assert not cpu.serves(sequences)
         expected = reference_divergence(network, sequences, chosen)
         assert torch.equal(divergence(network, sequences, chosen), expected)
+        assert add_gradients(network, sequences, chosen) == expected
     finally:
         cpu._functions.cache_clear()
         learning_library.cache_clear()
