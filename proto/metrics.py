@@ -96,8 +96,8 @@ class LearnerMetrics(Metrics):
         loss: loss of the last epoch; null at first.
         sequences: tutored sequences that it keeps, those of pre-training counted.
         round: round of corrections that it waits for or learns from, 0 before the first.
-        corrections: corrections of this round that it keeps.
-        corrections_total: corrections that this round has at most.
+        corrections: corrections of this round that it keeps; 0 unless it waits for them.
+        corrections_total: corrections that this round has at most; 0 unless it waits for them.
         epochs_per_s: epochs per second since the last metrics.
         policy_version: newest version published, 0 for none yet.
         paused: whether it was told to pause.

@@ -26,6 +26,7 @@ _LINE_PERIOD_S: Final = 5.0
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
+    parser.epilog = "There are no actors here, so learner.corrections makes no difference."
     add_config(parser)
     add_training_data(parser)
     parser.add_argument(

@@ -85,14 +85,14 @@ def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> N
         output, errors = process.communicate(timeout=280)
         assert process.returncode == 0, errors
         assert "going on with run smoke" in output
-        assert "3 policy versions" in output
-        assert "policy 3, 10 of 10 trials counted" in output
+        assert "4 policy versions" in output
+        assert "policy 4, 10 of 10 trials counted" in output
         assert not processes_that_name(str(tmp_path))
 
     sequences = {file.name: file.stat().st_mtime_ns for file in run.glob("tutoring/*.mcap")}
     assert kept.items() <= sequences.items(), "what was taught is not taught again"
-    assert len(sequences) == 3
-    assert len(list(run.glob("policies/*.safetensors"))) == 3
+    assert len(sequences) == 3 + 2, "what was tutored and what was corrected"
+    assert len(list(run.glob("policies/*.safetensors"))) == 4
     assert len(list(run.glob("rollouts/*.mcap"))) >= 10
     config = load_config(run / "config.yaml")
     assert config.run.name == "smoke"
@@ -104,7 +104,7 @@ def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> N
         assert "learner cannot go on" in errors
         assert not processes_that_name(str(tmp_path))
     assert load_config(run / "config.yaml") == config
-    assert len(list(run.glob("policies/*.safetensors"))) == 3
+    assert len(list(run.glob("policies/*.safetensors"))) == 4
 
 
 def test_a_process_that_is_given_bad_input_ends_the_run_and_says_why(tmp_path: Path) -> None:

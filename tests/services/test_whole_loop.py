@@ -14,12 +14,16 @@ from processes import eventually, listening_hub, stop, vmdnn
 
 from proto.bus import open_bus
 from proto.config import HubConfig
+from proto.episode import Kind
 from proto.keys import Role
 from proto.messages import Live, PolicyVersion
 from proto.metrics import METRICS, EvaluatorMetrics, LearnerMetrics, Metrics
 from proto.recording import read_episode
 
-VERSIONS = 4
+FIRST_VERSIONS = 4
+ROUNDS = 1
+VERSIONS = FIRST_VERSIONS + ROUNDS
+CORRECTED = 4
 TRIALS = 4
 CASES = (0, 11, 22, 44)
 PRETRAINING_CASES = (0, 14)
@@ -33,9 +37,15 @@ SETTINGS = {
     "learner.pretraining.cases": list(PRETRAINING_CASES),
     "learner.pretraining.repeats": 2,
     "learner.pretraining.epochs": 2,
-    "learner.epochs": 30 * VERSIONS,
+    "learner.epochs": 30 * FIRST_VERSIONS,
     "learner.publish_every_epochs": 30,
     "learner.checkpoint_every_epochs": 10,
+    "learner.corrections": {
+        "rounds": ROUNDS,
+        "choose": "random",
+        "sequences": CORRECTED,
+        "epochs": 20,
+    },
     "evaluator.trials_per_policy": TRIALS,
     "done.policy_versions": VERSIONS,
     "done.trials": TRIALS,
@@ -90,12 +100,16 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
         policies: list[PolicyVersion] = []
         told: dict[str, Metrics] = {}
         bus.subscribe(bus.keys.live("actor-1"), lives.append, Live)
+        kinds: set[Kind] = set()
+        bus.subscribe(bus.keys.live(), lambda live: kinds.add(live.kind), Live)
         bus.subscribe_newest(bus.keys.policy, policies.append, PolicyVersion)
         bus.subscribe(bus.keys.metrics(), lambda m: told.update({m.id: m}), *METRICS)
 
         eventually(lambda: any(live.step > 20 for live in lives), "a demonstration is going on")
         loop.kill_and_restart("actor", "actor-1")
         eventually(lambda: len(policies) >= 1, "a policy")
+        loop.kill_and_restart("learner", "learner")
+        eventually(lambda: Kind.CORRECTION in kinds, "a correction is going on")
         loop.kill_and_restart("learner", "learner")
         trials = loop.folder / "evaluation" / "trials.jsonl"
         eventually(lambda: trials.exists() and trials.stat().st_size > 0, "a counted trial")
@@ -137,7 +151,11 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
         sequences = [read_episode(path) for path in (loop.folder / folder).glob("*.mcap")]
         assert {episode.task for episode in sequences} == {task}
         planned = [case * 1000 + repeat for case in cases for repeat in (0, 1)]
-        assert sorted(episode.seed for episode in sequences) == sorted(planned)
+        shown = [episode.seed for episode in sequences if episode.kind is Kind.TUTORING]
+        assert sorted(shown) == sorted(planned)
+        corrected = {episode.seed for episode in sequences if episode.kind is Kind.CORRECTION}
+        assert len(corrected) == len(sequences) - len(planned)
+        assert len(corrected) == (ROUNDS * CORRECTED if folder == "tutoring" else 0)
 
     versions = [policy.version for policy in policies]
     assert versions == sorted(versions)
