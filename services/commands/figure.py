@@ -10,7 +10,7 @@ from typing import Final, Protocol
 
 from rich.console import Console
 
-from services.commands.figures import activity, failures, time_constants
+from services.commands.figures import activity, corrections, failures, time_constants
 from services.commands.figures.drawn import Drawn
 from services.figures.style import check_name, save
 
@@ -31,6 +31,7 @@ FIGURES: Final[Mapping[str, FigureCommand]] = {
     "activity": activity,
     "time-constants": time_constants,
     "failures": failures,
+    "corrections": corrections,
 }
 
 

@@ -1,0 +1,80 @@
+"""`vmdnn figure corrections`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+
+from proto.errors import UserError
+from proto.seeds import TRIALS_BELOW
+from services import lap_trials
+from services.commands.figures.drawn import Drawn
+from services.commands.options import positive, seed
+from services.figures import corrections
+from services.figures.corrections import Curve
+from services.lap_trials import Run
+from services.progress import progress_bar
+from services.success import Tally
+
+SUMMARY: Final = "success against the number of tutored cases, as policies are corrected"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the figure's arguments."""
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
+    parser.add_argument("--trials", type=positive, default=300, help="situations for each policy")
+    parser.add_argument(
+        "--seed", type=seed, default=1000, help="seed of the situations, the same for all"
+    )
+    parser.add_argument(
+        "--workers",
+        type=positive,
+        default=len(os.sched_getaffinity(0)),
+        help="processes to play in",
+    )
+
+
+def draw(arguments: argparse.Namespace) -> Drawn:
+    """Test what was not tested yet, then draw all."""
+    if arguments.seed + arguments.trials > TRIALS_BELOW:
+        raise UserError(
+            f"--seed {arguments.seed}: with seeds of {TRIALS_BELOW} and more a run may have been"
+            " tutored; take a smaller one"
+        )
+    runs = [lap_trials.open_run(folder) for folder in arguments.runs]
+    try:
+        curves = [_curve(run, arguments) for run in runs]
+    except KeyboardInterrupt:
+        told = Console(stderr=True)
+        told.print("stopped; the same command goes on with what was counted in the runs' folders")
+        raise
+    return Drawn(
+        corrections.draw(curves),
+        {
+            "trials": arguments.trials,
+            "seed": arguments.seed,
+            **corrections.numbers(curves),
+        },
+        corrections.table(curves),
+    )
+
+
+def _curve(run: Run, arguments: argparse.Namespace) -> Curve:
+    tallies = []
+    for lap_end in run.lap_ends:
+        words = f"{run.config.run.name}, policy {lap_end.version}"
+        with progress_bar(words, arguments.trials) as advance:
+            outcomes = lap_trials.test(
+                run,
+                lap_end,
+                arguments.trials,
+                arguments.seed,
+                workers=arguments.workers,
+                on_trial=advance,
+            )
+        tallies.append(Tally.of(outcomes))
+    return Curve(run, tallies)
