@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from learner.divergence import add_gradients
-from learner.interpolation import Neighbours
+from learner.interpolation import Cells, mixed
 from learner.sequences import Sequences
 from learner.softmax_code import SoftmaxCode
 from learner.vision_input import vision_input
@@ -37,13 +37,13 @@ class _Material:
         sequences: what is seen and the teacher's outputs.
         spread: (V_S units,) standard deviation of what each unit sees.
         targets: (S, T, 11) float32, the teacher's actions.
-        neighbours: whose situations are beside each other.
+        cells: whose situations are beside each other.
     """
 
     sequences: Sequences
     spread: Tensor
     targets: Tensor
-    neighbours: Neighbours
+    cells: Cells
 
 
 class CoupledTraining:
@@ -94,9 +94,10 @@ class CoupledTraining:
         """Mean divergence of eq. (5), for the sequences with these indices; adds its gradients."""
         material = self._all()
         shift = self._wrongly(len(chosen), material.spread)
-        sequences = material.sequences
-        if self._config.interpolation:
-            sequences = self._mixed(chosen, material)
+        sequences, share = material.sequences, self._config.interpolation
+        if share:
+            mixtures = material.cells.mixtures(chosen, share, self._generator)
+            sequences = mixed(mixtures, sequences, material.targets, self.code)
             chosen = torch.arange(len(chosen))
         return add_gradients(self._network, sequences, chosen, shift)
 
@@ -108,16 +109,9 @@ class CoupledTraining:
                 sequences,
                 spread=sequences.seen.std((0, 1)),
                 targets=pad_sequence(list(map(torch.from_numpy, self._targets)), True),
-                neighbours=Neighbours(self._situations, list(map(len, self._seen))),
+                cells=Cells(self._situations, list(map(len, self._seen))),
             )
         return self._material
-
-    def _mixed(self, chosen: Tensor, material: _Material) -> Sequences:
-        """These sequences, a share of them mixed with those of neighbouring situations."""
-        share, sequences = self._config.interpolation, material.sequences
-        mixture = material.neighbours.mixture(chosen, share, self._generator)
-        codes = torch.from_numpy(self.code.encode(mixture.of(material.targets).numpy()))
-        return Sequences.of(mixture.of(sequences.seen), codes, sequences.mask[chosen])
 
     def _wrongly(self, count: int, spread: Tensor) -> Tensor | None:
         """How wrongly V_S sees some sequences, each in one way from its start to its end.

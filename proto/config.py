@@ -225,8 +225,8 @@ class LearnerConfig(_Section):
     # in coupled training: disturbance of each unit of V_S, another one for each sequence and epoch,
     # in standard deviations of the unit's activity
     vision_noise: NotNegative = 0.15
-    # share of the sequences that are replaced by a mixture with those of a neighbouring situation,
-    # so that the network learns what to do between the tutored ones
+    # share of the sequences in whose place one between tutored situations is learned, guessed from
+    # the sequences around it
     interpolation: Annotated[float, Field(ge=0, le=1)] = 0.7
     initial_range: Positive = 0.1
     initial_range_pfc_input: Positive = 0.2
@@ -235,6 +235,54 @@ class LearnerConfig(_Section):
     threads: Count = 1
     pretraining: PretrainingConfig = PretrainingConfig()
     corrections: CorrectionsConfig = CorrectionsConfig()
+
+
+RivalKind = Literal["cnn-lstm", "feed-forward"]
+"""Networks of other kinds, which VMDNN is compared with."""
+
+
+class RivalConfig(_Section):
+    """A network of another kind, which learns in two stages as VMDNN does.
+
+    First all of it learns from pictures to outputs. Then its vision stays as it is, and the rest
+    learns on, from mixtures of neighbouring situations. Schedule, warm-up, minibatches, clipping
+    and, in the second stage, disturbance of what is seen are those of coupled training.
+
+    Attributes:
+        units: of its LSTM, or of its hidden layer.
+        together_epochs: epochs of the first stage.
+        epochs: epochs of the second stage.
+        rate: learning rate of Adam in either.
+        image_shift, image_gain, image_noise: disturbance of its pictures in the first stage, as in
+            pre-training.
+    """
+
+    units: Count
+    together_epochs: Count = 60
+    epochs: Count = 300
+    rate: Positive = 3e-3
+    image_shift: Annotated[int, Field(ge=0)] = 2
+    image_gain: NotNegative = 0.05
+    image_noise: NotNegative = 0.03
+
+
+class CnnLstmConfig(RivalConfig):
+    """A small CNN with an LSTM."""
+
+    units: Count = 44
+
+
+class FeedForwardConfig(RivalConfig):
+    """A small CNN with a hidden layer, which acts from the current picture alone."""
+
+    units: Count = 128
+
+
+class ComparisonConfig(_Section):
+    """The networks that `vmdnn compare` trains beside VMDNN; about as many weights by default."""
+
+    cnn_lstm: CnnLstmConfig = CnnLstmConfig()
+    feed_forward: FeedForwardConfig = FeedForwardConfig()
 
 
 class EvaluatorConfig(_Section):
@@ -280,6 +328,7 @@ class Config(_Section):
     tutor: TutorConfig = TutorConfig()
     network: NetworkConfig = NetworkConfig()
     learner: LearnerConfig = LearnerConfig()
+    comparison: ComparisonConfig = ComparisonConfig()
     evaluator: EvaluatorConfig = EvaluatorConfig()
     recorder: RecorderConfig = RecorderConfig()
     done: DoneConfig = DoneConfig()

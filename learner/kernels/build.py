@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 FOLDER: Final = Path(__file__).parent
-SOURCES: Final = ("core.cpp", "adam.cpp", "maps.cpp", "acting.cpp")
+SOURCES: Final = ("core.cpp", "adam.cpp", "mixing.cpp", "maps.cpp", "acting.cpp")
 HEADERS: Final = ("vectors.h", "lanes.h")
 FLAGS: Final = (
     "-std=c++17",

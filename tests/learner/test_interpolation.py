@@ -2,66 +2,105 @@ from __future__ import annotations
 
 from itertools import product
 
+import numpy as np
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner.interpolation import REACH, Mixture, Neighbours
+from learner.interpolation import Cells, Mixtures, mixed
+from learner.kernels import mixing
+from learner.sequences import Sequences
+from learner.softmax_code import SoftmaxCode
+from proto.action import ACTION_SIZE
+from proto.config import NetworkConfig
 
 PLACES, YAWS = (0.2, 0.25, 0.3), (-45.0, 0.0, 45.0)
 GRID = [{"yaw": yaw, "y": y} for y, yaw in product(PLACES, YAWS)]
 
 
-def drawn(neighbours: Neighbours, index: int, draws: int = 300) -> Mixture:
+def drawn(cells: Cells, index: int, share: float = 1.0, draws: int = 400) -> Mixtures:
     generator = torch.Generator().manual_seed(1)
-    return neighbours.mixture(torch.full((draws,), index), 1.0, generator)
+    return cells.mixtures(torch.full((draws,), index), share, generator)
 
 
-def test_neighbours_differ_in_one_value_and_none_lies_between() -> None:
-    neighbours = Neighbours(GRID, [10] * 9)
-    around = [sorted(set(drawn(neighbours, index).partners.tolist())) for index in range(9)]
-    assert around[0] == [1, 3]
-    assert around[1] == [0, 2, 4]
-    assert around[4] == [1, 3, 5, 7]
+def corners(cells: Cells, index: int) -> set[tuple[int, ...]]:
+    return {tuple(sorted(members)) for members in drawn(cells, index).members.tolist()}
 
 
-def test_every_repeat_of_a_neighbour_is_drawn_and_none_of_its_own_situation() -> None:
-    neighbours = Neighbours([GRID[0], GRID[1], GRID[1], GRID[0], GRID[1]], [10] * 5)
-    assert set(drawn(neighbours, 0).partners.tolist()) == {1, 2, 4}
+def test_a_sequence_is_mixed_with_those_at_the_corners_of_a_cell_around_it() -> None:
+    cells = Cells(GRID, [10] * 9)
+    assert corners(cells, 0) == {(0, 1, 3, 4)}
+    assert corners(cells, 1) == {(0, 1, 3, 4), (1, 2, 4, 5)}
+    assert corners(cells, 4) == {(0, 1, 3, 4), (1, 2, 4, 5), (3, 4, 6, 7), (4, 5, 7, 8)}
 
 
-def test_without_neighbours_a_sequence_stays_as_it_is() -> None:
-    elsewhere = {"y": 0.22, "yaw": 10.0}
-    neighbours = Neighbours([*GRID, elsewhere, {"y": 0.2}], [10] * 11)
-    values = torch.arange(11.0)
-    for index in (9, 10):
-        assert drawn(neighbours, index).of(values).eq(index).all()
+@given(seed=st.integers(0, 2**31), index=st.integers(0, 8))
+def test_a_mixture_lies_where_its_weights_say(seed: int, index: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    cells = Cells(GRID, [10] * 9)
+    mixtures = cells.mixtures(torch.full((50,), index), 1.0, generator)
+    assert (mixtures.weights >= 0).all()
+    assert torch.allclose(mixtures.weights.sum(1), torch.ones(50))
+    assert (mixtures.members[:, 0] == index).all()
+    places = torch.tensor([[one["y"], one["yaw"]] for one in GRID])
+    where = mixtures.of(places)
+    near = (where - places[index]).abs()
+    assert (near <= torch.tensor([0.0501, 45.01])).all()
+    assert len({tuple(one) for one in where.tolist()}) > 40
+
+
+def test_every_repeat_of_a_corner_is_drawn() -> None:
+    cells = Cells([GRID[0], GRID[1], GRID[1], GRID[1]], [10] * 4)
+    assert set(drawn(cells, 0).members.flatten().tolist()) == {0, 1, 2, 3}
+
+
+def test_a_situation_off_the_grid_stays_as_it_is() -> None:
+    cells = Cells([*GRID, {"y": 0.22, "yaw": 10.0}], [10] * 10)
+    assert drawn(cells, 9).members.eq(9).all()
+    assert corners(cells, 0) == {(0, 1, 3, 4)}
+
+
+def test_where_a_corner_is_missing_the_cell_is_flat() -> None:
+    cells = Cells(GRID[:5], [10] * 5)  # the lower row and two of the middle one
+    assert corners(cells, 0) == {(0, 1, 3, 4)}
+    assert (2, 2, 2, 2) not in corners(cells, 2)
+    assert all(set(members) <= {1, 2, 4} for members in corners(cells, 2))
 
 
 def test_sequences_of_different_lengths_are_not_mixed() -> None:
-    neighbours = Neighbours(GRID[:3], [10, 11, 10])
-    assert set(drawn(neighbours, 0).partners.tolist()) == {2}
-    assert set(drawn(neighbours, 1).partners.tolist()) == {1}
+    cells = Cells(GRID[:3], [10, 11, 10])
+    assert set(drawn(cells, 0).members.flatten().tolist()) == {0, 2}
+    assert set(drawn(cells, 1).members.flatten().tolist()) == {1}
 
 
-def test_mixtures_lie_between_and_a_little_beyond() -> None:
-    mixture = drawn(Neighbours(GRID, [10] * 9), 4, draws=2000)
-    assert -REACH <= mixture.weights.min() < -0.8 * REACH
-    assert 1 + 0.8 * REACH < mixture.weights.max() <= 1 + REACH
+def test_a_share_is_mixed_and_the_rest_stays() -> None:
+    mixtures = drawn(Cells(GRID, [10] * 9), 4, share=0.3, draws=2000)
+    kept = mixtures.weights[:, 0] == 1
+    assert abs(kept.float().mean() - 0.7) < 0.05
 
 
-@given(share=st.floats(0, 1), seed=st.integers(0, 2**31))
-def test_a_share_is_mixed_and_the_rest_stays(share: float, seed: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    chosen = torch.randint(9, (400,), generator=generator)
-    mixture = Neighbours(GRID, [10] * 9).mixture(chosen, share, generator)
-    values = torch.randn(9, 3, generator=generator)
-    kept = mixture.weights == 0
-    assert torch.equal(mixture.of(values)[kept], values[chosen][kept])
-    assert abs((~kept).float().mean() - share) < 0.15
-
-
-def test_a_mixture_is_linear() -> None:
-    mixture = Mixture(torch.tensor([0, 2]), torch.tensor([1, 2]), torch.tensor([0.25, 0.6]))
-    values = torch.tensor([[0.0, 4.0], [8.0, 0.0], [1.0, 1.0]])
-    assert torch.equal(mixture.of(values), torch.tensor([[2.0, 3.0], [1.0, 1.0]]))
+@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
+def test_the_kernel_mixes_as_numpy_does(kind: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    generator = torch.Generator().manual_seed(2)
+    ranges = (
+        -torch.rand(ACTION_SIZE, generator=generator),
+        torch.rand(ACTION_SIZE, generator=generator),
+    )
+    code = SoftmaxCode.of_ranges(*(each.numpy() for each in ranges), NetworkConfig())
+    seen = torch.randn(5, 7, 21, generator=generator, dtype=kind)
+    targets = torch.randn(5, 7, ACTION_SIZE, generator=generator, dtype=kind)  # some out of range
+    codes = torch.from_numpy(code.encode(targets.numpy())).to(kind)
+    sequences = Sequences.of(seen, codes, torch.ones(5, 7, dtype=kind))
+    mixtures = Mixtures(
+        torch.randint(5, (6, 4), generator=generator),
+        torch.rand(6, 4, generator=generator, dtype=kind).softmax(1),
+    )
+    if not mixing.serves(sequences):
+        pytest.skip("the kernels are not compiled here")
+    compiled = mixed(mixtures, sequences, targets, code)
+    monkeypatch.setattr(mixing, "serves", lambda _: False)
+    reference = mixed(mixtures, sequences, targets, code)
+    for name, tensor in vars(reference).items():
+        assert getattr(compiled, name).dtype == kind
+        np.testing.assert_allclose(getattr(compiled, name), tensor, rtol=2e-5, atol=2e-6)
