@@ -13,6 +13,7 @@ from actors.policy import Policy
 from actors.tasks.experiment1 import OBJECT_Y_M, OBJECT_YAW_DEG, OBSTACLE_X_M
 from actors.tasks.task import Situation
 from actors.tutor.plan import execution_noise, plan
+from learner.checkpoint import load_checkpoint
 from learner.policy import NetworkPolicy
 from proto.config import Config, TutorConfig
 from proto.episode import Floats, Image
@@ -99,4 +100,14 @@ def make_policy(name: str, config: Config) -> Policy:
             f"policy {name!r}: no such policy or checkpoint file. There are: tutor, "
             f"{', '.join(BASELINES)}, or the path of a .safetensors checkpoint."
         )
-    return NetworkPolicy.from_file(Path(name))
+    return _trained(Path(name))
+
+
+def _trained(path: Path) -> Policy:
+    """VMDNN, or one of the networks that it is compared with."""
+    checkpoint, origin = load_checkpoint(path), f"checkpoint {path}"
+    if checkpoint.metadata.rival is None:
+        return NetworkPolicy(checkpoint, origin)
+    from learner.comparison.policy import RivalPolicy  # noqa: PLC0415 - only this needs torch
+
+    return RivalPolicy(checkpoint, origin)

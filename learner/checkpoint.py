@@ -22,7 +22,7 @@ from safetensors.numpy import save as save_tensors
 from learner.softmax_code import SoftmaxCode
 from learner.subnets import parameter_shapes
 from proto.action import ACTION_SIZE
-from proto.config import NetworkConfig
+from proto.config import NetworkConfig, RivalKind
 from proto.errors import UserError
 from proto.files import written_whole
 from proto.metrics import Stage
@@ -57,6 +57,18 @@ class TrainingMetadata(_Model):
     classes: dict[str, tuple[float, ...]]
 
 
+class RivalMetadata(_Model):
+    """A network of another kind than VMDNN; see `learner.comparison`.
+
+    Attributes:
+        kind: which kind.
+        units: of its LSTM or its hidden layer.
+    """
+
+    kind: RivalKind
+    units: int
+
+
 class CheckpointMetadata(_Model):
     """What a checkpoint says about itself.
 
@@ -68,11 +80,12 @@ class CheckpointMetadata(_Model):
         epoch: epochs of that stage that are done.
         loss: loss of the last of them, or None.
         config_digest: digest of the effective configuration.
-        network: the network.
+        network: the network; of a rival only its pictures and outputs.
         code: ranges of the outputs; None as long as the network cannot act.
         cases: different situations that this stage has learned from; 0 if that was not counted.
         sequences: sequences that it has learned from; 0 if that was not counted.
         training: None in a policy.
+        rival: None for VMDNN.
     """
 
     format: Literal[1] = 1
@@ -87,6 +100,7 @@ class CheckpointMetadata(_Model):
     cases: int = 0
     sequences: int = 0
     training: TrainingMetadata | None = None
+    rival: RivalMetadata | None = None
 
     def softmax_code(self) -> SoftmaxCode | None:
         """The code of the outputs, or None as long as the network cannot act."""
@@ -215,7 +229,7 @@ def _check_tensors(checkpoint: Checkpoint, origin: str) -> None:
     network = checkpoint.part(NETWORK_PREFIX)
     shapes = {name: tensor.shape for name, tensor in network.items()}
     wanted = parameter_shapes(checkpoint.metadata.network)
-    if shapes != wanted:
+    if checkpoint.metadata.rival is None and shapes != wanted:
         wrong = sorted(
             name for name in shapes.keys() | wanted.keys() if shapes.get(name) != wanted.get(name)
         )

@@ -48,6 +48,8 @@ class NetworkPolicy:
             UserError: the checkpoint is from pre-training and cannot act yet.
         """
         metadata = checkpoint.metadata
+        if metadata.rival is not None:
+            raise UserError(f"{origin} is no VMDNN, but the {metadata.rival.kind} network")
         code = metadata.softmax_code()
         if code is None:
             raise UserError(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from learner.disturbance import disturbed
 from learner.loss import kl_divergence
 from learner.mtrnn import run_levels
 from learner.vision_input import vision_input
@@ -116,28 +117,8 @@ class Pretraining:
     def _see(self, images: Sequence[Image]) -> Tensor:
         """V_S (B, T, units) for pictures of any lengths T; filled up at the end with black."""
         grey = nn.utils.rnn.pad_sequence([torch.from_numpy(each) for each in images], True)
-        return self._network.see(self._disturbed(torch.from_numpy(vision_input(grey.numpy()))))
-
-    def _disturbed(self, images: Tensor) -> Tensor:
-        """Images (B, T, H, W), those of each sequence shifted, brightened and with noise.
-
-        Few situations are tutored; without this the vision learns them by heart.
-        """
-        config, generator = self._config, self._generator
-        batch, _, height, width = images.shape
-        reach = config.image_shift
-        padded = functional.pad(images, (reach,) * 4, mode="replicate")
-        corners = torch.randint(2 * reach + 1, (batch, 2), generator=generator).tolist()
-        shifted = torch.stack(
-            [
-                one[:, top : top + height, left : left + width]
-                for one, (top, left) in zip(padded, corners, strict=True)
-            ]
-        )
-        gain, offset = config.image_gain * torch.randn(2, batch, 1, 1, 1, generator=generator)
-        noise = config.image_noise * torch.randn(shifted.shape, generator=generator)
-        disturbed: Tensor = shifted * (1 + gain) + offset + noise
-        return disturbed
+        seen = torch.from_numpy(vision_input(grey.numpy()))
+        return self._network.see(disturbed(seen, self._config, self._generator))
 
     def _asked(self, lengths: Sequence[int]) -> Tensor:
         """(B, T) one in the last part of each sequence, where the answer is asked for."""

@@ -81,34 +81,3 @@ def test_vision_learns_to_tell_situations_apart(
     # the motor pathway has not been touched
     for before, after in zip(motor_before, (feedback, network.mtrnn_slow.input), strict=True):
         assert torch.equal(before, after)
-
-
-def test_disturbed_pictures_are_shifted_whole_and_differ_between_sequences(
-    small_config: Callable[..., Config],
-    bar_episodes: Callable[..., Sequence[Episode]],
-) -> None:
-    _, lesson = lesson_of(small_config(), bar_episodes(steps=5), image_shift=2)
-    images = torch.rand(6, 5, 12, 16)
-    disturbed = lesson._disturbed(images)
-    shifts = []
-    for before, after in zip(images, disturbed, strict=True):
-        fits = [
-            (down, right)
-            for down in range(-2, 3)
-            for right in range(-2, 3)
-            if torch.equal(
-                after[:, 2:-2, 2:-2], before[:, 2 + down : 10 + down, 2 + right : 14 + right]
-            )
-        ]
-        assert len(fits) == 1
-        shifts += fits
-    assert len(set(shifts)) > 1
-
-
-def test_undisturbed_pictures_stay_as_they_are(
-    small_config: Callable[..., Config],
-    bar_episodes: Callable[..., Sequence[Episode]],
-) -> None:
-    _, lesson = lesson_of(small_config(), bar_episodes(steps=5))
-    images = torch.rand(2, 5, 12, 16)
-    assert torch.equal(lesson._disturbed(images), images)
