@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from math import prod
+from typing import Final
 
 import torch
 from torch import Tensor
@@ -21,6 +22,13 @@ from torch import Tensor
 from learner.kernels import mixing as kernel
 from learner.sequences import Sequences
 from learner.softmax_code import SoftmaxCode
+
+REACH: Final = 0.1
+"""Points are drawn up to this part of a cell's width beyond its sides.
+
+Else the outermost situations would be at the end of all that is learned about, and what is learned
+there would be drawn towards the middle.
+"""
 
 
 @dataclass(frozen=True)
@@ -66,13 +74,14 @@ class Cells:
         self._cells = {place: _cells_at(place, beside) for place in self._shown}
 
     def mixtures(self, chosen: Tensor, share: float, generator: torch.Generator) -> Mixtures:
-        """Draw a point of a cell around a share of the sequences with these indices.
+        """Draw a point in a cell around a share of the sequences with these indices.
 
         The rest stay as they are.
         """
         count = len(chosen)
         mixed, cells = torch.rand(2, count, generator=generator)
-        parts = torch.rand(self._dimensions, count, generator=generator) * (mixed < share)
+        parts = torch.rand(self._dimensions, count, generator=generator)
+        parts = (parts * (1 + 2 * REACH) - REACH) * (mixed < share)
         corners = product(*((1 - part, part) for part in parts))
         weights = torch.stack([prod(factors, start=torch.ones(count)) for factors in corners], 1)
         repeats = torch.rand(weights.shape, generator=generator)

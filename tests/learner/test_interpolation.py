@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner.interpolation import Cells, Mixtures, mixed
+from learner.interpolation import REACH, Cells, Mixtures, mixed
 from learner.kernels import mixing
 from learner.sequences import Sequences
 from learner.softmax_code import SoftmaxCode
@@ -40,13 +40,12 @@ def test_a_mixture_lies_where_its_weights_say(seed: int, index: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     cells = Cells(GRID, [10] * 9)
     mixtures = cells.mixtures(torch.full((50,), index), 1.0, generator)
-    assert (mixtures.weights >= 0).all()
     assert torch.allclose(mixtures.weights.sum(1), torch.ones(50))
     assert (mixtures.members[:, 0] == index).all()
     places = torch.tensor([[one["y"], one["yaw"]] for one in GRID])
     where = mixtures.of(places)
     near = (where - places[index]).abs()
-    assert (near <= torch.tensor([0.0501, 45.01])).all()
+    assert (near <= (1 + REACH) * torch.tensor([0.0501, 45.01])).all()
     assert len({tuple(one) for one in where.tolist()}) > 40
 
 
