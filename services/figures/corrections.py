@@ -62,18 +62,15 @@ def numbers(curves: Sequence[Curve]) -> dict[str, Any]:
 def table(curves: Sequence[Curve]) -> Table:
     """Success after each round."""
     result = Table(caption="% of the trials with the 95 % interval")
-    for heading in ("run", "corrected", "round", "policy", "cases", "sequences", *READINGS):
-        result.add_column(heading, justify="left" if heading in {"run", "corrected"} else "right")
+    for heading in ("run", "round", "cases", *READINGS):
+        result.add_column(heading, justify="left" if heading == "run" else "right")
     for curve in curves:
         for lap_end, tally in curve.points:
             first = lap_end is curve.run.lap_ends[0]
             result.add_row(
-                curve.run.config.run.name if first else "",
-                curve.choose if first else "",
+                f"{curve.run.config.run.name}: {curve.choose}" if first else "",
                 str(lap_end.round),
-                str(lap_end.version),
                 str(lap_end.cases),
-                str(lap_end.sequences),
                 *(_text(tally, reading) for reading in READINGS),
             )
         result.add_section()

@@ -132,11 +132,8 @@ def train_in_laps(
     while trainer.epochs_done < end:
         if trainer.round_begins:
             number = trainer.round
-            given = {
-                "id": f"corrected-{number}",
-                "kind": Kind.CORRECTION,
-                "situation": {"a": number},
-            }
+            between = {"object_y_m": 0.22 + 0.01 * number, "object_yaw_deg": 10.0}
+            given = {"id": f"corrected-{number}", "kind": Kind.CORRECTION, "situation": between}
             store.add(replace(episodes[number], **given))
         losses.append(trainer.epoch())
     return losses
