@@ -144,7 +144,7 @@ def _chosen(config: Config, number: int, situations: Situations) -> list[Correct
             return [Correction(task, seed, situations.sample(seed)) for seed in seeds]
         case "tutored":
             tutored = situations.tutored()
-            cases = config.learner.cases or range(len(tutored))
+            cases = list(dict.fromkeys(config.learner.cases or range(len(tutored))))
             count = min(corrections.sequences, len(cases))
             start = (number - 1) * count
             turns = [cases[(start + turn) % len(cases)] for turn in range(count)]

@@ -156,10 +156,10 @@ class LearnerProcess:
 
     @property
     def _stage(self) -> Stage:
-        material = self._materials.get(self._trainer.next_stage)
+        awaited, material = self._round, self._materials.get(self._trainer.next_stage)
         waiting = material is not None and not material.enough
-        if self._round is not None:
-            waiting = not self._round.complete
+        if awaited is not None:
+            waiting = not awaited.complete
         return Stage.WAITING if waiting else self._trainer.stage
 
     @property
