@@ -38,48 +38,65 @@ def run(
 
     h = tanh(v). Arguments as of `learner.mtrnn.recurrent_scan`; `initial` (N, B) is v before.
     """
-    steps, units, batch = drive.shape
-    by_sequence = drive.permute(2, 0, 1).contiguous()
-    hidden = torch.empty_like(by_sequence)
-    bounds = _bounds(units, immediate)
-    blocks = [(start, block) for start, block in zip(bounds[1:], immediate, strict=False)]
-    padded = _power_of_2(units)
-    _kernels().run[(batch,)](
-        by_sequence,
-        keep.contiguous(),
-        initial.T.contiguous(),
-        _wide(drive, units, padded, [(0, delayed)]),
-        _wide(drive, units, _width(immediate, 1), blocks),
-        hidden,
-        steps,
-        units,
-        **_constants(bounds, padded, _width(immediate, 1)),
-    )
-    return hidden.permute(1, 2, 0)
+    bounds = _bounds(drive.shape[1], immediate)
+    blocks = list(zip(bounds[1:], immediate, strict=False))
+    return _launch(_kernels().run, (_by_sequence(drive), initial.T), keep, delayed, blocks, bounds)
 
 
 def run_back(
     by_hidden: Tensor, hidden: Tensor, keep: Tensor, delayed: Tensor, immediate: Sequence[Tensor]
 ) -> Tensor:
     """dE/dv (T, N, B) from dE/dh, for what `run` gave."""
-    steps, units, batch = hidden.shape
-    by_sequence = by_hidden.permute(2, 0, 1).contiguous()
-    deltas = torch.empty_like(by_sequence)
-    bounds = _bounds(units, immediate)
+    bounds = _bounds(hidden.shape[1], immediate)
     blocks = [(start, block.T) for start, block in zip(bounds, immediate, strict=False)]
+    given = (_by_sequence(by_hidden), _by_sequence(hidden))
+    return _launch(_kernels().run_back, given, keep, delayed.T, blocks, bounds)
+
+
+def _launch(
+    kernel: Any,
+    given: Sequence[Tensor],
+    keep: Tensor,
+    delayed: Tensor,
+    blocks: Sequence[tuple[int, Tensor]],
+    bounds: Sequence[int],
+) -> Tensor:
+    """What a kernel makes (T, N, B) of arrays of which the first is (B, T, N).
+
+    Args:
+        kernel: of `learner.kernels.scan`.
+        given: what it reads.
+        keep: (N,).
+        delayed: (N, N) weights of the step before, or after.
+        blocks: weights within a step, each with its first row.
+        bounds: where each level begins.
+    """
+    batch, steps, units = given[0].shape
     padded = _power_of_2(units)
-    _kernels().run_back[(batch,)](
-        by_sequence,
-        hidden.permute(2, 0, 1).contiguous(),
+    width = _power_of_2(max((block.shape[1] for _, block in blocks), default=1))
+    second, third = (*bounds[1:], padded, padded)[:2]
+    result = torch.empty_like(given[0])
+    kernel[(batch,)](
+        *(each.contiguous() for each in given),
         keep.contiguous(),
-        _wide(hidden, units, padded, [(0, delayed.T)]),
-        _wide(hidden, units, _width(immediate, 0), blocks),
-        deltas,
+        _wide(keep, units, padded, [(0, delayed)]),
+        _wide(keep, units, width, blocks),
+        result,
         steps,
         units,
-        **_constants(bounds, padded, _width(immediate, 0)),
+        LEVELS=len(bounds),
+        SECOND=second,
+        THIRD=third,
+        PADDED=padded,
+        WIDTH=width,
+        **_LAUNCH,
     )
-    return deltas.permute(1, 2, 0)
+    return result.permute(1, 2, 0)
+
+
+def _by_sequence(activity: Tensor) -> Tensor:
+    """(T, N, B) as (B, T, N)."""
+    return activity.permute(2, 0, 1).contiguous()
 
 
 def _bounds(units: int, immediate: Sequence[Tensor]) -> list[int]:
@@ -88,29 +105,12 @@ def _bounds(units: int, immediate: Sequence[Tensor]) -> list[int]:
     return [0, *(units - end for end in reversed(later[1:]))]
 
 
-def _width(immediate: Sequence[Tensor], side: int) -> int:
-    """Columns that hold any block of weights, of which `side` are the columns."""
-    return _power_of_2(max((block.shape[side] for block in immediate), default=1))
-
-
 def _wide(like: Tensor, rows: int, columns: int, blocks: Sequence[tuple[int, Tensor]]) -> Tensor:
     """Blocks in a matrix of zeros, each from a row on."""
     matrix = like.new_zeros(rows, columns)
     for start, block in blocks:
         matrix[start : start + block.shape[0], : block.shape[1]] = block
     return matrix
-
-
-def _constants(bounds: Sequence[int], padded: int, width: int) -> dict[str, int]:
-    second, third = (*bounds[1:], padded, padded)[:2]
-    return {
-        "LEVELS": len(bounds),
-        "SECOND": second,
-        "THIRD": third,
-        "PADDED": padded,
-        "WIDTH": width,
-        **_LAUNCH,
-    }
 
 
 def _power_of_2(size: int) -> int:

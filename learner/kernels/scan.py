@@ -50,8 +50,8 @@ def _of_level(x, START: tl.constexpr, COUNT: tl.constexpr):
 @triton.jit
 def run(
     drive,  # (B, T, N)
-    keep,  # (N,)
     initial,  # (B, N)
+    keep,  # (N,)
     delayed,  # (N, PADDED), to x from
     immediate,  # (N, WIDTH), to x from the level before
     hidden,  # (B, T, N), written
