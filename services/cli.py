@@ -33,6 +33,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "tutor": ("services.commands.tutor", "record tutoring sequences, without the bus"),
     "train": ("services.commands.train", "train a network on recorded sequences"),
     "evaluate": ("services.commands.evaluate", "test a policy on unlearned situations"),
+    "compare": ("services.commands.compare", "train and test VMDNN and other networks"),
     "figure": ("services.commands.figure", "draw a figure of the paper, or of failures"),
     "replay": ("services.commands.replay", "make a video of a recorded episode"),
     "recover": ("services.commands.recover", "repair an MCAP file that was cut off"),

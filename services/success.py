@@ -49,6 +49,12 @@ class Rate:
         return {"successes": self.successes, "rate": self.rate, "wilson95": list(self.wilson95)}
 
 
+def pooled(tallies: Iterable[Tally], reading: str) -> Rate:
+    """The rate over the trials of several tallies."""
+    rates = [tally.rate(reading) for tally in tallies]
+    return Rate(sum(rate.successes for rate in rates), sum(rate.trials for rate in rates))
+
+
 def difference95(one: Rate, other: Rate) -> tuple[float, float]:
     """Newcombe's interval at 95 % for how much higher the rate of `one` is, from Wilson's."""
     difference = one.rate - other.rate

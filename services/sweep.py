@@ -1,4 +1,4 @@
-"""Training and testing of many networks that differ in one setting and in their seed.
+"""Training and testing of many networks: variants of a configuration, each with several seeds.
 
 Each network has a folder of its own, as a run has: config, checkpoints, policies and the trials
 that were counted. What is there is not done again, so a sweep goes on where it was stopped.
@@ -6,19 +6,26 @@ that were counted. What is there is not done again, so a sweep goes on where it 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import operator
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
+from typing import Self
 
 from pydantic import ValidationError
 
 from learner.checkpoint import load_checkpoint, policy_file, training_file
+from learner.comparison.networks import rival_config
+from learner.comparison.training import train_rival
 from learner.offline import open_training, run_training
 from learner.store import TutoringStore
-from proto.config import Config, load_config
+from proto.config import Config, RivalKind, load_config
 from proto.episode import Outcome
 from proto.errors import UserError
+from proto.files import written_whole
 from proto.messages import Rollout
 from proto.metrics import Stage
 from services.evaluation import trial_jobs
@@ -27,16 +34,47 @@ from services.trial_book import TrialBook
 
 
 @dataclass(frozen=True)
+class Variant:
+    """What some networks of a sweep have in common.
+
+    Attributes:
+        name: what its networks are called, and the beginning of the names of their folders.
+        config: what their training depends on, besides the seed.
+        rival: which kind of network is trained in VMDNN's place, or None.
+    """
+
+    name: str
+    config: Config
+    rival: RivalKind | None = None
+
+    @classmethod
+    def of(cls, name: str, config: Config, changes: Mapping[str, object]) -> Self:
+        """A config in which some values, named as in `network.pfc.tau`, are others.
+
+        Raises:
+            UserError: one of them is not valid.
+        """
+        values = config.model_dump()
+        for key, value in changes.items():
+            *sections, last = key.split(".")
+            reduce(operator.getitem, sections, values)[last] = value
+        try:
+            return cls(name, Config.model_validate(values))
+        except ValidationError as error:
+            raise UserError(f"{name}: {error.errors()[0]['msg']}") from error
+
+
+@dataclass(frozen=True)
 class Member:
     """One network of a sweep.
 
     Attributes:
-        tau: time constant of its PFC.
+        variant: what it is one of.
         seed: seed of its weights and of the order of its training.
         config: everything its training depends on; its run folder is the network's own.
     """
 
-    tau: float
+    variant: Variant
     seed: int
     config: Config
 
@@ -54,17 +92,13 @@ class Tested:
     outcomes: Sequence[Outcome]
 
 
-def members_of(
-    config: Config, taus: Sequence[float], seeds: Sequence[int], folder: Path
-) -> list[Member]:
-    """A network for each time constant and seed; all time constants of the first seed first.
+def members_of(variants: Sequence[Variant], seeds: Sequence[int], folder: Path) -> list[Member]:
+    """A network for each variant and seed; all variants of the first seed first.
 
     Raises:
         UserError: one of the folders holds a network of another config.
     """
-    members = [
-        Member(tau, seed, _config(config, tau, seed, folder)) for seed in seeds for tau in taus
-    ]
+    members = [_member(variant, seed, folder) for seed in seeds for variant in variants]
     for member in members:
         _claim(member)
     return members
@@ -84,18 +118,30 @@ def train(
     Args:
         member: the network.
         store: its tutored sequences.
-        pretraining_store: sequences for its pre-training, if others.
+        pretraining_store: sequences for its pre-training, if others; a rival has no use for them.
         go_on: called with the loss after each epoch; False stops the training.
     """
-    trainer = open_training(member.config, member.folder, store, pretraining_store)
-    run_training(trainer, member.config.learner, member.folder, go_on)
-    return trainer.finished
+    config, folder, rival = member.config, member.folder, member.variant.rival
+    before, started = training_s(member), time.process_time()
+    try:
+        if rival is not None:
+            return train_rival(config, rival, folder, store, go_on)
+        trainer = open_training(config, folder, store, pretraining_store)
+        run_training(trainer, config.learner, folder, go_on)
+        return trainer.finished
+    finally:
+        _note_training_s(member, before + time.process_time() - started)
+
+
+def training_s(member: Member) -> float:
+    """Processor time that its training has taken so far (s); what a kill cut off is not in it."""
+    path = _time_file(member)
+    return float(path.read_text()) if path.exists() else 0.0
 
 
 def epochs_of(member: Member) -> int:
     """Epochs of a whole training."""
-    learner = member.config.learner
-    return learner.pretraining.epochs + learner.epochs
+    return sum(_epochs(member))
 
 
 def epochs_done(member: Member) -> int:
@@ -104,8 +150,8 @@ def epochs_done(member: Member) -> int:
     if not path.exists():
         return 0
     metadata = load_checkpoint(path).metadata
-    before = 0 if metadata.stage is Stage.PRETRAINING else member.config.learner.pretraining.epochs
-    return before + metadata.epoch
+    first, _ = _epochs(member)
+    return metadata.epoch + (0 if metadata.stage is Stage.PRETRAINING else first)
 
 
 def test(
@@ -137,18 +183,27 @@ def test(
     return Tested(member, [counted[job.seed] for job in jobs])
 
 
-def _config(config: Config, tau: float, seed: int, folder: Path) -> Config:
-    network = config.network.model_copy(
-        update={"pfc": config.network.pfc.model_copy(update={"tau": tau})}
-    )
-    run = config.run.model_copy(
-        update={"name": f"tau{tau:g}_seed{seed}", "folder": folder, "seed": seed}
-    )
-    changed = config.model_copy(update={"network": network, "run": run})
-    try:
-        return Config.model_validate(changed.model_dump())  # model_copy checks nothing
-    except ValidationError as error:
-        raise UserError(f"tau {tau:g}, seed {seed}: {error.errors()[0]['msg']}") from error
+def _member(variant: Variant, seed: int, folder: Path) -> Member:
+    named = {"run.name": f"{variant.name}_seed{seed}", "run.folder": folder, "run.seed": seed}
+    return Member(variant, seed, Variant.of(f"seed {seed}", variant.config, named).config)
+
+
+def _epochs(member: Member) -> tuple[int, int]:
+    """Epochs of the two stages of its training."""
+    learner, rival = member.config.learner, member.variant.rival
+    if rival is None:
+        return learner.pretraining.epochs, learner.epochs
+    settings = rival_config(member.config.comparison, rival)
+    return settings.together_epochs, settings.epochs
+
+
+def _time_file(member: Member) -> Path:
+    return member.folder / "training_s.txt"
+
+
+def _note_training_s(member: Member, seconds: float) -> None:
+    with written_whole(_time_file(member)) as stream:
+        stream.write(f"{seconds:.1f}\n".encode())
 
 
 def _claim(member: Member) -> None:

@@ -8,7 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+
 from actors.tasks.task import Situation, Task
+from learner.store import TutoringStore
 from proto.config import Config, load_config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
@@ -95,6 +98,34 @@ def tutoring_jobs(config: Config, cases: Sequence[Case], folder: Path) -> list[J
     ]
 
 
+def tutoring_jobs_again(store: TutoringStore, folder: Path) -> list[Job]:
+    """Jobs that tutor once more what the sequences of a store show, under the same names.
+
+    Raises:
+        UserError: a sequence was not shown by the tutor alone, so it cannot be shown again.
+    """
+    jobs = []
+    for name in store.ids:
+        episode = store.load(name)
+        if episode is None:
+            continue
+        if episode.kind is not Kind.TUTORING or episode.policy != "tutor":
+            raise UserError(
+                f"{name} in {store.folder} was not shown by the tutor alone, but by"
+                f" {episode.policy}; take sequences that `vmdnn tutor` recorded"
+            )
+        jobs.append(
+            Job(
+                situation=episode.situation,
+                seed=episode.seed,
+                kind=Kind.TUTORING,
+                noisy=not np.array_equal(episode.actions, episode.targets),
+                record_to=folder / f"{name}.mcap",
+            )
+        )
+    return jobs
+
+
 def record(
     config: Config, jobs: Sequence[Job], folder: Path, *, workers: int
 ) -> Generator[Episode, None, None]:
@@ -129,9 +160,20 @@ def _recorded(job: Job) -> Episode | None:
 
 def _claim(folder: Path, config: Config) -> None:
     """Save the configuration with the first recording, and keep to it with all others."""
+    check_recorded(folder, config)
     saved = folder / "config.yaml"
     if not saved.exists():
         config.save(saved)
+
+
+def check_recorded(folder: Path, config: Config) -> None:
+    """Refuse a folder that says it was recorded with another task, simulator or tutor.
+
+    Raises:
+        UserError: it does; the message names each value.
+    """
+    saved = folder / "config.yaml"
+    if not saved.exists():
         return
     before, now = _what_matters(load_config(saved)), _what_matters(config)
     changed = [name for name in now if before[name] != now[name]]

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from services.figures.style import BLACK, BLUE, GREY, look, percent
-from services.success import READINGS, Rate, Tally, difference95
+from services.success import READINGS, Rate, Tally, difference95, pooled
 from services.sweep import Tested
 
 PAPER: Final[Mapping[float, Rate]] = {30.0: Rate(32, 52), 150.0: Rate(44, 52)}
@@ -26,15 +26,9 @@ Tallies = Mapping[float, Mapping[int, Tally]]
 def tallies_of(tested: Sequence[Tested]) -> Tallies:
     """Count the outcomes; both keys are in order."""
     by_tau: dict[float, dict[int, Tally]] = defaultdict(dict)
-    for each in sorted(tested, key=lambda each: (each.member.tau, each.member.seed)):
-        by_tau[each.member.tau][each.member.seed] = Tally.of(each.outcomes)
+    for each in sorted(tested, key=lambda each: (_tau(each), each.member.seed)):
+        by_tau[_tau(each)][each.member.seed] = Tally.of(each.outcomes)
     return by_tau
-
-
-def pooled(tallies: Mapping[int, Tally], reading: str) -> Rate:
-    """The rate over the trials of all seeds."""
-    rates = [tally.rate(reading) for tally in tallies.values()]
-    return Rate(sum(rate.successes for rate in rates), sum(rate.trials for rate in rates))
 
 
 def numbers(tallies: Tallies) -> dict[str, Any]:
@@ -44,7 +38,9 @@ def numbers(tallies: Tallies) -> dict[str, Any]:
             {
                 "tau": tau,
                 "trials": sum(tally.trials for tally in by_seed.values()),
-                "pooled": {reading: pooled(by_seed, reading).as_json() for reading in READINGS},
+                "pooled": {
+                    reading: pooled(by_seed.values(), reading).as_json() for reading in READINGS
+                },
                 "by_seed": {str(seed): tally.as_json() for seed, tally in by_seed.items()},
                 "against_150": {
                     reading: _against(tallies, tau, reading)
@@ -70,7 +66,7 @@ def table(tallies: Tallies) -> Table:
         result.add_column(heading, justify="right" if heading == "tau" else "left")
     for tau, by_seed in tallies.items():
         for reading in READINGS:
-            rate = pooled(by_seed, reading)
+            rate = pooled(by_seed.values(), reading)
             low, high = rate.wilson95
             seeds = ", ".join(f"{100 * tally.rate(reading).rate:.0f}" for tally in by_seed.values())
             result.add_row(
@@ -104,7 +100,7 @@ def draw(tallies: Tallies) -> Figure:
 def _draw_reading(axes: Axes, tallies: Tallies, reading: str) -> None:
     published = "paper (lifted at the end)"
     _draw_rates(axes, PAPER, -4.0, color=GREY, marker="D", linestyle="none", label=published)
-    rates = {tau: pooled(by_seed, reading) for tau, by_seed in tallies.items()}
+    rates = {tau: pooled(by_seed.values(), reading) for tau, by_seed in tallies.items()}
     _draw_rates(axes, rates, 0.0, color=BLUE, marker="o", linewidth=1.0, label="ours, all seeds")
     places = [(tau, tally) for tau, by_seed in tallies.items() for tally in by_seed.values()]
     axes.scatter(
@@ -133,7 +129,7 @@ def _draw_rates(axes: Axes, rates: Mapping[float, Rate], nudge: float, **look_of
 
 
 def _against(tallies: Tallies, tau: float, reading: str) -> dict[str, Any]:
-    rate, papers = pooled(tallies[tau], reading), pooled(tallies[PAPERS_TAU], reading)
+    rate, papers = (pooled(tallies[each].values(), reading) for each in (tau, PAPERS_TAU))
     return {"difference": rate.rate - papers.rate, "interval95": list(difference95(rate, papers))}
 
 
@@ -143,3 +139,7 @@ def _against_text(tallies: Tallies, tau: float, reading: str) -> str:
     found = _against(tallies, tau, reading)
     low, high = found["interval95"]
     return f"{100 * found['difference']:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+
+
+def _tau(tested: Tested) -> float:
+    return tested.member.config.network.pfc.tau

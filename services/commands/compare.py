@@ -1,0 +1,85 @@
+"""`vmdnn compare`: VMDNN beside other networks, on the same sequences and situations."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from contextlib import closing
+from pathlib import Path
+
+from rich.console import Console
+
+from learner.store import TutoringStore
+from proto.config import Config
+from services import comparison
+from services.commands.options import add_config, add_playing, playing_config
+from services.commands.sweeping import Stores, add_sweep, run_sweep
+from services.commands.training_options import add_training_data, training_stores
+from services.comparison import CONTENDERS, FIXED_GAZE, Retutoring
+from services.progress import progress_bar
+from services.sweep import Variant
+from services.tutoring import record
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the subcommand's arguments."""
+    add_config(parser)
+    add_playing(parser)
+    add_training_data(parser)
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=tuple(CONTENDERS),
+        default=list(CONTENDERS),
+        help="which of the networks",
+    )
+    add_sweep(parser, trials=300)
+    parser.add_argument(
+        "--work",
+        type=Path,
+        required=True,
+        help="folder of the networks and their trials, where the same command goes on",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train and test what is missing, then print how each network did."""
+    config = playing_config(arguments)
+    stores = training_stores(arguments)
+
+    def stores_of(variant: Variant) -> Stores:
+        if variant.name != FIXED_GAZE:
+            return stores
+        return _tutored_again(stores, variant, config, arguments)
+
+    contenders = comparison.variants(config, arguments.only)
+    tested = run_sweep(arguments, contenders, arguments.work, stores_of)
+    found = comparison.standings(tested)
+    if arguments.json:
+        print(json.dumps(comparison.numbers(found)))
+    else:
+        Console().print(comparison.table(found))
+    return 0
+
+
+def _tutored_again(
+    stores: Stores, variant: Variant, config: Config, arguments: argparse.Namespace
+) -> Stores:
+    """The same sequences as the robot sees them that keeps its head and focus still."""
+
+    def again(store: TutoringStore, name: str) -> TutoringStore:
+        folder = arguments.work / f"{variant.name}_{name}"
+        tutoring = Retutoring.of(store, variant, config, folder)
+        episodes = record(tutoring.config, tutoring.jobs, folder, workers=arguments.workers)
+        total = len(tutoring.jobs)
+        with progress_bar(f"{variant.name}: {name}", total) as advance, closing(episodes):
+            for _ in episodes:
+                advance()
+        return TutoringStore(folder)
+
+    coupled, others = stores
+    return (
+        again(coupled, "tutoring"),
+        None if others is None else again(others, "pretraining"),
+    )
