@@ -15,6 +15,7 @@ from actors.tasks.task import Situation
 from actors.tutor.plan import execution_noise, plan
 from learner.checkpoint import load_checkpoint
 from learner.policy import NetworkPolicy
+from learner.pretrained import checkpoint_path, pretrained_names
 from proto.config import Config, TutorConfig
 from proto.episode import Floats, Image
 from proto.errors import UserError
@@ -86,7 +87,7 @@ def make_tutor(config: Config, *, noisy: bool) -> PlannedPolicy:
 
 
 def make_policy(name: str, config: Config) -> Policy:
-    """Make the policy called `name`: tutor, a baseline, or the path of a checkpoint.
+    """Make the policy called `name`: tutor, a baseline, a path, or `pretrained:NAME`.
 
     Raises:
         UserError: there is no such policy or file.
@@ -95,12 +96,14 @@ def make_policy(name: str, config: Config) -> Policy:
         return make_tutor(config, noisy=False)
     if name in BASELINES:
         return PlannedPolicy(name, BASELINES[name])
-    if not Path(name).is_file():
+    path = checkpoint_path(name)
+    if not path.is_file():
         raise UserError(
             f"policy {name!r}: no such policy or checkpoint file. There are: tutor, "
-            f"{', '.join(BASELINES)}, or the path of a .safetensors checkpoint."
+            f"{', '.join([*BASELINES, *pretrained_names()])}, or the path of a .safetensors"
+            " checkpoint."
         )
-    return _trained(Path(name))
+    return _trained(path)
 
 
 def _trained(path: Path) -> Policy:

@@ -19,6 +19,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from learner.pretrained import checkpoint_path
 from learner.softmax_code import SoftmaxCode
 from learner.subnets import parameter_shapes
 from proto.action import ACTION_SIZE
@@ -181,14 +182,14 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
         stream.write(checkpoint_bytes(checkpoint))
 
 
-def load_checkpoint(path: Path) -> Checkpoint:
-    """Read a checkpoint.
+def load_checkpoint(path: str | Path) -> Checkpoint:
+    """Read a checkpoint: a file, or one that comes with the package (`pretrained:NAME`).
 
     Raises:
         UserError: the file is missing, damaged or foreign.
     """
     try:
-        blob = path.read_bytes()
+        blob = checkpoint_path(path).read_bytes()
     except OSError as error:
         raise UserError(f"checkpoint {path} cannot be read: {error.strerror}") from error
     return checkpoint_from_bytes(blob, f"checkpoint {path}")

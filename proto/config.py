@@ -224,7 +224,7 @@ class LearnerConfig(_Section):
     clip_norm: Positive | None = 1.0
     # in coupled training: disturbance of each unit of V_S, another one for each sequence and epoch,
     # in standard deviations of the unit's activity
-    vision_noise: NotNegative = 0.15
+    vision_noise: NotNegative = 0.3
     # share of the sequences in whose place one between tutored situations is learned, guessed from
     # the sequences around it
     interpolation: Annotated[float, Field(ge=0, le=1)] = 0.7

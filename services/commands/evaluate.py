@@ -33,7 +33,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--policy",
         required=True,
-        help="tutor, replay, yaw-blind, obstacle-blind, lookup, or a checkpoint's file",
+        help="pretrained:experiment1, tutor, replay, yaw-blind, obstacle-blind, lookup, or a"
+        " checkpoint's file",
     )
     parser.add_argument("--trials", type=positive, default=52, help="how many situations")
     parser.add_argument(
