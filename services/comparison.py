@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -15,10 +15,9 @@ from learner.subnets import subnets
 from proto.config import Config
 from proto.episode import Episode
 from proto.errors import UserError
-from services.playing import Job
 from services.success import READINGS, Tally, difference95, pooled
 from services.sweep import Tested, Variant, training_s
-from services.tutoring import check_recorded, tutoring_jobs_again
+from services.tutoring import check_recorded, record, tutoring_jobs_again
 
 VMDNN: Final = "vmdnn"
 FIXED_GAZE: Final = "fixed-gaze"
@@ -57,37 +56,26 @@ def weights(variant: Variant) -> int:
     return weights_of(make_rival(variant.rival, units, config.network))
 
 
-@dataclass(frozen=True)
-class Retutoring:
-    """Sequences that are to be tutored again under another config.
+def tutored_again(
+    store: TutoringStore, variant: Variant, active: Config, folder: Path, *, workers: int
+) -> Generator[Episode, None, None]:
+    """Tutor a variant in what a store shows, its cases and its noise, and yield all episodes.
 
-    Attributes:
-        config: it.
-        jobs: what is played.
-        folder: where they are recorded.
+    Args:
+        store: sequences that were tutored as the config `active` says, but for the task.
+        variant: who is to learn from it.
+        active: the config of VMDNN.
+        folder: where the episodes are recorded; what it holds is not played again.
+        workers: processes to play in.
+
+    Raises:
+        UserError: a sequence was shown otherwise, or not by the tutor alone.
     """
-
-    config: Config
-    jobs: Sequence[Job]
-    folder: Path
-
-    @classmethod
-    def of(cls, store: TutoringStore, variant: Variant, active: Config, folder: Path) -> Retutoring:
-        """What a store shows, its cases and its noise, for a variant to learn from.
-
-        Args:
-            store: sequences that were tutored as the config `active` says, but for the task.
-            variant: who is to learn.
-            active: the config of VMDNN.
-            folder: where the new sequences are recorded.
-
-        Raises:
-            UserError: a sequence was shown otherwise, or not by the tutor alone.
-        """
-        task = {"task.name": _task_of(store)}
-        check_recorded(store.folder, Variant.of("data", active, task).config)
-        jobs = tutoring_jobs_again(store, folder)
-        return cls(Variant.of(variant.name, variant.config, task).config, jobs, folder)
+    task = {"task.name": _task_of(store)}
+    check_recorded(store.folder, Variant.of("data", active, task).config)
+    jobs = tutoring_jobs_again(store, folder)
+    config = Variant.of(variant.name, variant.config, task).config
+    return record(config, jobs, folder, workers=workers)
 
 
 def _task_of(store: TutoringStore) -> str:

@@ -15,10 +15,9 @@ from services import comparison
 from services.commands.options import add_config, add_playing, playing_config
 from services.commands.sweeping import Stores, add_sweep, run_sweep
 from services.commands.training_options import add_training_data, training_stores
-from services.comparison import CONTENDERS, FIXED_GAZE, Retutoring
+from services.comparison import CONTENDERS, FIXED_GAZE
 from services.progress import progress_bar
 from services.sweep import Variant
-from services.tutoring import record
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -70,10 +69,11 @@ def _tutored_again(
 
     def again(store: TutoringStore, name: str) -> TutoringStore:
         folder = arguments.work / f"{variant.name}_{name}"
-        tutoring = Retutoring.of(store, variant, config, folder)
-        episodes = record(tutoring.config, tutoring.jobs, folder, workers=arguments.workers)
-        total = len(tutoring.jobs)
-        with progress_bar(f"{variant.name}: {name}", total) as advance, closing(episodes):
+        episodes = comparison.tutored_again(
+            store, variant, config, folder, workers=arguments.workers
+        )
+        what = f"{variant.name}: {name}"
+        with progress_bar(what, len(store)) as advance, closing(episodes):
             for _ in episodes:
                 advance()
         return TutoringStore(folder)
