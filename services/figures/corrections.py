@@ -128,4 +128,4 @@ def _numbers_of(lap_end: LapEnd, tally: Tally) -> Mapping[str, Any]:
 def _text(tally: Tally, reading: str) -> str:
     rate = tally.rate(reading)
     low, high = rate.wilson95
-    return f"{100 * rate.rate:.1f} ({100 * low:.1f} to {100 * high:.1f})"
+    return f"{100 * rate.rate:.1f} ({100 * low:.0f} to {100 * high:.0f})"
