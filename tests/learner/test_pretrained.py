@@ -1,0 +1,22 @@
+from __future__ import annotations
+
+import pytest
+
+from learner.checkpoint import load_checkpoint
+from learner.policy import NetworkPolicy
+from learner.pretrained import PREFIX, checkpoint_path, pretrained_names
+from proto.errors import UserError
+
+
+def test_what_comes_with_the_package_can_act() -> None:
+    assert f"{PREFIX}experiment1" in pretrained_names()
+    for name in pretrained_names():
+        checkpoint = load_checkpoint(name)
+        NetworkPolicy(checkpoint, name).begin({}, 0)
+        assert checkpoint.metadata.training is None  # nothing but the network
+        assert checkpoint_path(name).stat().st_size < 200_000
+
+
+def test_a_wrong_name_lists_those_there_are() -> None:
+    with pytest.raises(UserError, match=r"no policy pretrained:dance.*pretrained:experiment1"):
+        load_checkpoint(f"{PREFIX}dance")
