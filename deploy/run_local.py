@@ -50,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.backend is not None:
             overrides.append(f"simulator.backend={arguments.backend}")
         config = load_config(arguments.config, overrides)
-        actors = default_actors(config) if arguments.actors is None else arguments.actors
+        actors = default_actors() if arguments.actors is None else arguments.actors
         if trouble := port_trouble(config.hub.endpoint):
             raise UserError(trouble)
         run(config, actors, Console())
@@ -63,9 +63,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def default_actors(config: Config) -> int:
-    """One actor for each core that the learner leaves, at least one."""
-    return max(1, len(os.sched_getaffinity(0)) - config.learner.threads)
+def default_actors() -> int:
+    """One actor for each core: while the learner computes, they share what it leaves."""
+    return len(os.sched_getaffinity(0))
 
 
 def run(config: Config, actors: int, console: Console) -> None:

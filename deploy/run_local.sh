@@ -13,7 +13,7 @@ prints a summary. Started again with the same run, it goes on where it was.
 
   --config FILE     the run (default: deploy/config/experiment1.yaml); a run of a few minutes is
                     deploy/config/smoke.yaml
-  --actors N        how many actors (default: one for each core that the learner leaves)
+  --actors N        how many actors (default: one for each core)
   --backend NAME    the simulator: a built-in one, or your own as package.module:Class
   --set KEY=VALUE   override a value of the config, such as learner.rate=1e-3; may be repeated
 

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import os
+from typing import Final
 
 from actors.process import ActorProcess
 from proto.bus import open_bus
 from proto.keys import Role
 from proto.process import Lifecycle, own_id
 from services.commands.options import add_process, config_of, start_logging
+
+NICENESS: Final = 10
+"""Where cores are few, the learner comes first: everyone waits for its next policy."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -19,6 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Play until told to stop."""
     start_logging("actor")
+    os.nice(NICENESS)
     config = config_of(arguments)
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()

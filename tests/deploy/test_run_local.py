@@ -18,7 +18,6 @@ from deploy.run_local import (
     TOO_MANY_CRASHES,
     Crashes,
     ProcessFailedError,
-    default_actors,
     main,
     programs,
 )
@@ -175,7 +174,6 @@ def test_threads_and_actors_follow_the_config() -> None:
     assert by_name["actor"].threads == 1
     assert by_name["actor"].processes == 5
     assert "actor" not in {p.name for p in programs(config, Path("config.yaml"), 0)}
-    assert default_actors(Config(learner=LearnerConfig(threads=1000))) == 1
 
 
 def state(tmp_path: Path, **given: object) -> ProcessState:
