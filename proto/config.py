@@ -259,7 +259,7 @@ class RivalConfig(_Section):
 
     units: Count
     together_epochs: Count = 60
-    epochs: Count = 300
+    epochs: Count = 600
     rate: Positive = 3e-3
     image_shift: Annotated[int, Field(ge=0)] = 2
     image_gain: NotNegative = 0.05
