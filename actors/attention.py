@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.simulator import EYE_HEIGHT, EYE_WIDTH, Crop, JointTargets
-from proto.action import ACTION_VALUES, ARM, FOCUS, GRASP, NECK
+from proto.body import ACTION_VALUES, ARM, FOCUS, GRASP, NECK
 from sim_assets.hand import motors_from_grasp
 
 Array = NDArray[np.float64]

@@ -13,21 +13,21 @@ from typing import Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.actor import Assignment, live_message
 from actors.attention import crop_of_focus, targets_of_action
 from actors.player import LiveStep, play
-from actors.policies import make_tutor
-from actors.policy import Policy
-from actors.process import Assignment, live_message
+from actors.policies.by_name import make_tutor
+from actors.policies.contract import Policy
 from actors.simulator import Simulator, make_simulator
+from actors.tasks.contract import Situation, Task
+from actors.tasks.experiment1.plan import plan
 from actors.tasks.registry import make_task
-from actors.tasks.task import Situation, Task
-from actors.tutor.plan import plan
 from learner.checkpoint import NETWORK_PREFIX, Checkpoint, CheckpointMetadata, CodeRanges
-from learner.policy import NetworkPolicy
-from learner.stepping import Parameters, SteppingNetwork, make_acting_network
-from learner.subnets import parameter_shapes
-from learner.vision_input import vision_input
-from proto.action import ACTION_VALUES, FOCUS
+from learner.network.numpy_network import NumpyNetwork, Parameters, make_acting_network
+from learner.network.subnets import parameter_shapes
+from learner.network.vision_input import vision_input
+from learner.network_policy import NetworkPolicy
+from proto.body import ACTION_VALUES, FOCUS
 from proto.codec import encode
 from proto.config import Config, NetworkConfig
 from proto.episode import Floats, Image, Kind
@@ -229,7 +229,7 @@ class _OtherNetworks:
     def __init__(self, checkpoint: Checkpoint) -> None:
         self.numpy_laps, self.core_laps = _Laps(), _Laps()
         parameters = cast("Parameters", checkpoint.part(NETWORK_PREFIX))
-        self._numpy = NetworkPolicy(checkpoint, "the benchmark", SteppingNetwork)
+        self._numpy = NetworkPolicy(checkpoint, "the benchmark", NumpyNetwork)
         self._parts = make_acting_network(checkpoint.metadata.network, parameters)
 
     def step(self, image: Image) -> None:

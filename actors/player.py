@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.attention import attention_of, clip_action, crop_of_focus, targets_of_action
-from actors.policy import Policy
+from actors.policies.contract import Policy
 from actors.simulator import Simulator
-from actors.tasks.task import Situation, Task
-from proto.action import FOCUS
+from actors.tasks.contract import Situation, Task
+from proto.body import FOCUS
 from proto.episode import Episode, Image, Kind
 
 Array = NDArray[np.float64]

@@ -18,10 +18,10 @@ from proto.bus import Bus, open_bus
 from proto.config import Config, load_config
 from proto.errors import UserError
 from proto.keys import Role
+from proto.membership import METRICS_PERIOD_S, Lifecycle
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
-from proto.process import METRICS_PERIOD_S, Lifecycle
-from services.ports import port_trouble
-from services.watch import Board, View, display, success_words
+from services.board import Board, View, display, success_words
+from services.machine.ports import port_trouble
 
 DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
 VMDNN: Final = str(Path(sys.executable).with_name("vmdnn"))

@@ -19,14 +19,14 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from learner.network.softmax_code import SoftmaxCode
+from learner.network.subnets import parameter_shapes
 from learner.pretrained import checkpoint_path
-from learner.softmax_code import SoftmaxCode
-from learner.subnets import parameter_shapes
-from proto.action import ACTION_SIZE
+from proto.body import ACTION_SIZE
 from proto.config import NetworkConfig, RivalKind
 from proto.errors import UserError
-from proto.files import written_whole
 from proto.metrics import Stage
+from proto.storage import written_whole
 
 Tensors = Mapping[str, NDArray[np.generic]]
 
@@ -59,7 +59,7 @@ class TrainingMetadata(_Model):
 
 
 class RivalMetadata(_Model):
-    """A network of another kind than VMDNN; see `learner.comparison`.
+    """A network of another kind than VMDNN; see `learner.rivals`.
 
     Attributes:
         kind: which kind.

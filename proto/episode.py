@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
+from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
 from proto.codec import Added, Array, Integer, Many, Maybe, Number, Size, Table, Text
 
 Image = NDArray[np.uint8]
@@ -105,7 +105,7 @@ class Episode:
         policy_version: version of the policy, 0 for one never trained.
         config_digest: digest of the effective configuration.
         images: (T, 48, 64) uint8, the network's grey picture before normalization.
-        actions: (T, 11) float32, what the robot was told (units of `proto.action`).
+        actions: (T, 11) float32, what the robot was told (units of `proto.body`).
         targets: (T, 11) float32, what was meant: the clean plan where the tutor executed it with
             noise or guided a policy, else equal to the actions.
         joints_deg: (T, 18) float32, measured before the action: neck, arm, hand motors.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Final
 
-from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
+from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Table, Text, message
 from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind, Outcome
 from proto.keys import Role

@@ -12,11 +12,11 @@ from proto.config import Config
 from proto.episode import Episode, Kind, Outcome
 from proto.keys import Role
 from proto.leases import Leases
+from proto.membership import Lifecycle, alone_in_run, membership
 from proto.messages import PolicyVersion, Receipt, Rollout, Trial, TrialRequest, Verdict
 from proto.metrics import EvaluatorMetrics, PolicyScore, Success
-from proto.process import Lifecycle, alone_in_run, membership
-from services.success import Tally
-from services.trial_book import TrialBook
+from services.trials.success import Tally
+from services.trials.trial_log import TrialLog
 
 LOG = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class Evaluator:
         self._config = config
         self._bus = bus
         self._lifecycle = lifecycle
-        self._book = TrialBook(config.run_folder / "evaluation" / "trials.jsonl")
+        self._book = TrialLog(config.run_folder / "evaluation" / "trials.jsonl")
         self._leases: Leases[tuple[Policy, int]] = Leases(config.evaluator.lease_s)
         first = config.evaluator.seed
         self._seeds = range(first, first + config.evaluator.trials_per_policy)

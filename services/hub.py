@@ -7,8 +7,8 @@ import time
 
 from proto.bus import open_hub
 from proto.config import Config
+from proto.membership import Lifecycle, membership
 from proto.metrics import HubMetrics
-from proto.process import Lifecycle, membership
 
 LOG = logging.getLogger(__name__)
 

@@ -16,10 +16,10 @@ from proto.config import Config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.keys import Role
+from proto.membership import Lifecycle, membership
 from proto.messages import Rollout
 from proto.metrics import RecorderMetrics
-from proto.process import Lifecycle, membership
-from proto.recording import write_episode
+from proto.recordings.episodes import write_episode
 
 LOG = logging.getLogger(__name__)
 

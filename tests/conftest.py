@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from proto.action import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
+from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
 from proto.episode import Episode, Kind, Outcome, Reason
 
 # how long an example takes says more of what else the machine does than of the code

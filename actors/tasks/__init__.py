@@ -1,1 +1,1 @@
-"""The tasks of the paper: their situations, scenes and readings of success."""
+"""The tasks of the paper, one folder each, and the registry that finds them by name."""

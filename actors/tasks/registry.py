@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from actors.tasks.experiment1 import Experiment1
-from actors.tasks.reaching import Reaching
-from actors.tasks.task import Task
+from actors.tasks.contract import Task
+from actors.tasks.experiment1.reaching import Reaching
+from actors.tasks.experiment1.task import Experiment1
 from proto.config import TaskConfig
 
 TASKS = {task.name: task for task in (Experiment1, Reaching)}

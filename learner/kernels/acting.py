@@ -1,6 +1,6 @@
 """The network that acts, compiled: one call of C++ for what it sees, one for what it does.
 
-It computes in float32 what `learner.stepping` says in numpy. See `acting.cpp` for how.
+It computes in float32 what `learner.network.numpy_network` says in numpy. See `acting.cpp` for how.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from learner.kernels.build import NotCompiledError, find_or_compile
-from learner.subnets import Subnet, parameter_shapes, subnets
+from learner.network.subnets import Subnet, parameter_shapes, subnets
 from proto.config import NetworkConfig
 
 Array = NDArray[np.floating]
@@ -61,7 +61,7 @@ def available() -> bool:
 
 
 class CompiledNetwork:
-    """A network in C++ with the interface and, to float32, the numbers of `SteppingNetwork`.
+    """A network in C++ with the interface and, to float32, the numbers of `NumpyNetwork`.
 
     Args:
         config: the network's sizes.

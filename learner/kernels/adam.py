@@ -27,7 +27,7 @@ def step(
     rate: float,
     longest: float,
 ) -> None:
-    """`learner.adam.reference_step`, computed by the kernel."""
+    """`learner.training.adam.reference_step`, computed by the kernel."""
     _functions()[weights.dtype](
         len(weights),
         *(array.data_ptr() for array in (weights, gradient, means, squares)),

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from torch.autograd.function import FunctionCtx
 
 from learner.kernels.library import learning_library
-from learner.sequences import Sequences
-from learner.vmdnn import VMDNN
+from learner.network.vmdnn import VMDNN
+from learner.training.sequences import Sequences
 
 _COUNTS: Final = (
     *("levels", "inputs", "values", "softmax_units"),
@@ -62,7 +62,7 @@ def divergence(
     initial: Tensor | None = None,
     shift: Tensor | None = None,
 ) -> Tensor:
-    """`learner.divergence.divergence`, computed by the kernel."""
+    """`learner.training.divergence.divergence`, computed by the kernel."""
     differentiable = (initial, shift, sequences.seen, *network.core_parameters())
     wanted = [
         torch.is_grad_enabled() and each is not None and each.requires_grad
@@ -77,7 +77,7 @@ def divergence(
 def add_gradients(
     network: VMDNN, sequences: Sequences, chosen: Tensor, shift: Tensor | None = None
 ) -> float:
-    """`learner.divergence.add_gradients`, computed by the kernel."""
+    """`learner.training.divergence.add_gradients`, computed by the kernel."""
     parameters = network.core_parameters()
     gradients = _Gradients(by_parameters=[_gradient_of(each) for each in parameters])
     return _call(network, sequences, chosen, None, shift, parameters, gradients)
@@ -141,7 +141,7 @@ class _Divergence(torch.autograd.Function):
         if torch.is_grad_enabled():
             raise RuntimeError(
                 "the compiled recurrent core gives first derivatives only, so create_graph=True"
-                " does not work on it; differentiate learner.divergence.reference_divergence"
+                " does not work on it; use reference_divergence"
             )
         (by_loss,) = by_outputs
         (pfc_input,) = ctx.saved_tensors

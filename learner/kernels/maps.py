@@ -38,7 +38,7 @@ def serves(below: Tensor) -> bool:
 
 
 def maps(below: Tensor, kernel: Tensor, bias: Tensor, stride: int, tau: float) -> Tensor:
-    """`learner.mstnn.Maps`, computed by the kernel; differentiable once.
+    """`learner.network.mstnn.Maps`, computed by the kernel; differentiable once.
 
     Args:
         below: (B, T, maps below, height, width).

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from learner.kernels.library import learning_library
-from learner.sequences import Sequences
-from learner.softmax_code import SoftmaxCode
+from learner.network.softmax_code import SoftmaxCode
+from learner.training.sequences import Sequences
 
 _COUNTS: Final = ("mixtures", "parts", "steps", "inputs", "values", "softmax_units")
 _ARRAYS: Final = (
@@ -44,7 +44,7 @@ def mixed(
     code: SoftmaxCode,
     mask: Tensor,
 ) -> Sequences:
-    """`learner.interpolation.mixed`, computed by the kernel."""
+    """`learner.training.interpolation.mixed`, computed by the kernel."""
     seen = sequences.seen.contiguous()
     count, parts = members.shape
     _, steps, inputs = seen.shape

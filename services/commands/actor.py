@@ -6,11 +6,11 @@ import argparse
 import os
 from typing import Final
 
-from actors.process import ActorProcess
+from actors.actor import Actor
 from proto.bus import open_bus
 from proto.keys import Role
-from proto.process import Lifecycle, own_id
-from services.commands.options import add_process, config_of, start_logging
+from proto.membership import Lifecycle, own_id
+from services.arguments.common import add_process, config_of, start_logging
 
 NICENESS: Final = 10
 """Where cores are few, the learner comes first: everyone waits for its next policy."""
@@ -32,5 +32,5 @@ def run(arguments: argparse.Namespace) -> int:
         own_id(config.run_folder, Role.ACTOR, arguments.id) as process,
         open_bus(config.hub, config.run.name, Role.ACTOR, process) as bus,
     ):
-        ActorProcess(config, bus, lifecycle).run()
+        Actor(config, bus, lifecycle).run()
     return 0

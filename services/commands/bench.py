@@ -10,8 +10,8 @@ from dataclasses import asdict
 from typing import Any
 
 from actors.bench import bench_actor
-from learner.bench import bench_bptt
-from services.commands.options import add_config, config_of, positive
+from learner.bench.bptt import bench_bptt
+from services.arguments.common import add_config, config_of, positive
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +28,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     bptt.add_argument(
         "--threads", type=positive, default=len(os.sched_getaffinity(0)), help="of each contender"
     )
-    bptt.add_argument("--device", choices=["cpu", "cuda"], default="cpu", help="where to compute")
     for subject in (actor, bptt):
         add_config(subject)
         subject.add_argument("--json", action="store_true", help="print JSON instead of lines")
@@ -45,7 +44,6 @@ def run(arguments: argparse.Namespace) -> int:
             batch=arguments.batch,
             steps=arguments.steps,
             threads=arguments.threads,
-            device=arguments.device,
         )
         speed = _rounded(asdict(measured))
     if arguments.json:

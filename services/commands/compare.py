@@ -9,15 +9,15 @@ from pathlib import Path
 
 from rich.console import Console
 
-from learner.store import TutoringStore
+from learner.tutoring.store import TutoringStore
 from proto.config import Config
-from services import comparison
-from services.commands.options import add_config, add_playing, playing_config
-from services.commands.sweeping import Stores, add_sweep, run_sweep
-from services.commands.training_options import add_training_data, training_stores
-from services.comparison import CONTENDERS, FIXED_GAZE
-from services.progress import progress_bar
-from services.sweep import Variant
+from services.arguments.common import add_config, add_playing, playing_config
+from services.arguments.sweeping import Stores, add_sweep, run_sweep
+from services.arguments.training import add_training_data, training_stores
+from services.terminal.progress import progress_bar
+from services.trials import comparison
+from services.trials.comparison import CONTENDERS, FIXED_GAZE
+from services.trials.sweeps import Variant
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -7,8 +7,8 @@ import json
 import textwrap
 from dataclasses import asdict
 
-from services.commands.options import add_config, config_of
-from services.doctor import examine
+from services.arguments.common import add_config, config_of
+from services.machine.doctor import examine
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

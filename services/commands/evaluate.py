@@ -15,15 +15,15 @@ from rich.console import Console
 from actors.tasks.registry import make_task
 from proto.config import Config
 from proto.errors import UserError
-from proto.files import written_whole
-from services.commands.options import add_config, add_playing, playing_config, positive
-from services.evaluation import parse_situation, result_json, situation_jobs, trial_jobs
-from services.playing import Job, play_all
-from services.progress import progress_bar
-from services.replay import write_video
-from services.success import Tally
-from services.tables import success_table
-from services.trial_book import CountedTrial
+from proto.storage import written_whole
+from services.arguments.common import add_config, add_playing, playing_config, positive
+from services.playing.video import write_video
+from services.playing.workers import Job, play_all
+from services.terminal.progress import progress_bar
+from services.terminal.tables import success_table
+from services.trials.evaluation import parse_situation, result_json, situation_jobs, trial_jobs
+from services.trials.success import Tally
+from services.trials.trial_log import CountedTrial
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -6,8 +6,8 @@ import argparse
 
 from proto.bus import open_bus
 from proto.keys import Role
-from proto.process import Lifecycle, only_one
-from services.commands.options import add_process, config_of, start_logging
+from proto.membership import Lifecycle, only_one
+from services.arguments.common import add_process, config_of, start_logging
 from services.evaluator import Evaluator
 
 

@@ -11,7 +11,7 @@ from typing import Final, Protocol
 from rich.console import Console
 
 from services.commands.figures import activity, corrections, failures, time_constants
-from services.commands.figures.drawn import Drawn
+from services.figures.drawn import Drawn
 from services.figures.style import check_name, save
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from proto.process import Lifecycle
-from services.commands.options import add_process, config_of, start_logging
+from proto.membership import Lifecycle
+from services.arguments.common import add_process, config_of, start_logging
 from services.hub import Hub
 
 

@@ -14,14 +14,14 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from actors.tasks.experiment1 import SUBTASKS
+from actors.tasks.experiment1.task import SUBTASKS
 from learner.checkpoint import load_checkpoint
-from learner.probing import Answer, Probe, Vision, ask_classifier, probe
-from learner.store import TutoringStore
-from learner.subnets import Subnet, subnets
+from learner.network.subnets import Subnet, subnets
+from learner.network.vision_probe import Answer, Probe, Vision, ask_classifier, probe
+from learner.tutoring.store import TutoringStore
 from proto.episode import Episode
-from services.commands.options import add_config, config_of
-from services.commands.training_options import filled_store
+from services.arguments.common import add_config, config_of
+from services.arguments.training import filled_store
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 
 from actors.tasks.registry import TASKS
-from learner.process import LearnerProcess
+from learner.learner import Learner
 from proto.bus import open_bus
 from proto.keys import Role
-from proto.process import Lifecycle, only_one
-from services.commands.options import add_process, config_of, start_logging
+from proto.membership import Lifecycle, only_one
+from services.arguments.common import add_process, config_of, start_logging
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -29,5 +29,5 @@ def run(arguments: argparse.Namespace) -> int:
         only_one(config.run_folder, Role.LEARNER, "learner"),
         open_bus(config.hub, config.run.name, Role.LEARNER, process) as bus,
     ):
-        LearnerProcess(config, bus, lifecycle, tasks=tasks).run()
+        Learner(config, bus, lifecycle, tasks=tasks).run()
     return 0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from proto.keys import Role
-from proto.process import Lifecycle, only_one
-from services.commands.options import add_process, config_of, start_logging
+from proto.membership import Lifecycle, only_one
+from services.arguments.common import add_process, config_of, start_logging
 from services.recorder import Recorder
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from proto.recovery import recover
+from proto.recordings.recovery import recover
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

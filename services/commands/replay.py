@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 
 from proto.config import SimulatorConfig
-from proto.recording import read_episode
-from services.progress import progress_bar
-from services.replay import write_video
+from proto.recordings.episodes import read_episode
+from services.playing.video import write_video
+from services.terminal.progress import progress_bar
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -13,12 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from learner.checkpoint import policy_file, training_file
-from learner.offline import open_training, run_training
-from learner.training import Trainer
-from proto.action import ARM, FOCUS, GRASP, NECK
+from learner.training.trainer import Trainer
+from learner.training.training_run import open_training, run_training
+from proto.body import ARM, FOCUS, GRASP, NECK
 from proto.metrics import Stage
-from services.commands.options import add_config, config_of
-from services.commands.training_options import add_training_data, interruption, training_stores
+from services.arguments.common import add_config, config_of
+from services.arguments.training import add_training_data, interruption, training_stores
 
 _INTERRUPTED: Final = 130
 _LINE_PERIOD_S: Final = 5.0

@@ -9,11 +9,11 @@ from pathlib import Path
 from rich.console import Console
 
 from actors.tasks.registry import make_task
-from services.commands.options import add_config, add_playing, playing_config, positive, seed
-from services.progress import progress_bar
-from services.success import Tally
-from services.tables import success_table
-from services.tutoring import parse_cases, record, tutoring_jobs
+from services.arguments.common import add_config, add_playing, playing_config, positive, seed
+from services.playing.tutoring import parse_cases, record, tutoring_jobs
+from services.terminal.progress import progress_bar
+from services.terminal.tables import success_table
+from services.trials.success import Tally
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

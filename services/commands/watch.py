@@ -12,9 +12,9 @@ from rich.console import Console
 
 from proto.bus import open_bus
 from proto.keys import Role
-from proto.process import METRICS_PERIOD_S, Lifecycle
-from services.commands.options import add_connection, config_of
-from services.watch import Board, View, display, tables
+from proto.membership import METRICS_PERIOD_S, Lifecycle
+from services.arguments.common import add_connection, config_of
+from services.board import Board, View, display, tables
 
 ONCE_WITHIN_S: Final = 2.5 * METRICS_PERIOD_S
 

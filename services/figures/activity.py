@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from actors.policy import StatefulPolicy
-from learner.subnets import ACTIVATION_GAIN
-from proto.action import ACTION_NAMES, ARM, FOCUS, GRASP, NECK
+from actors.policies.contract import StatefulPolicy
+from learner.network.subnets import ACTIVATION_GAIN
+from proto.body import ACTION_NAMES, ARM, FOCUS, GRASP, NECK
 from proto.episode import Episode, Floats, States
 from proto.errors import UserError
 from services.figures.style import BLACK, look, words_and_unit

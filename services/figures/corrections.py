@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from services.figures.style import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, look, percent
-from services.lap_trials import LapEnd, Run
-from services.success import Tally
+from services.trials.round_trials import LapEnd, Run
+from services.trials.success import Tally
 
 READINGS: Final = ("strict", "precise")
 _COLOURS: Final = (BLUE, ORANGE, GREEN, PINK, SKY, RED, BLACK)

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from actors.tasks import experiment1
-from actors.tasks.task import Task
+from actors.tasks.contract import Task
+from actors.tasks.experiment1 import task as experiment1
 from proto.episode import Outcome, Reason
 from proto.errors import UserError
 from services.figures.style import (
@@ -35,8 +35,8 @@ from services.figures.style import (
     percent,
     words_and_unit,
 )
-from services.success import Rate
-from services.trial_book import CountedTrial
+from services.trials.success import Rate
+from services.trials.trial_log import CountedTrial
 
 Array = NDArray[np.float64]
 

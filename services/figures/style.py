@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from proto.errors import UserError
-from proto.files import written_whole
-from services.success import Rate
+from proto.storage import written_whole
+from services.trials.success import Rate
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from services.figures.style import BLACK, BLUE, GREY, look, percent
-from services.success import READINGS, Rate, Tally, difference95, pooled
-from services.sweep import Tested
+from services.trials.success import READINGS, Rate, Tally, difference95, pooled
+from services.trials.sweeps import Tested
 
 PAPER: Final[Mapping[float, Rate]] = {30.0: Rate(32, 52), 150.0: Rate(44, 52)}
 """What the paper published; it counts what is lifted at the end, our `lenient`."""

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from actors.player import play
-from actors.policies import make_policy, make_tutor
+from actors.policies.by_name import make_policy, make_tutor
 from actors.simulator import make_simulator
-from actors.tasks.experiment1 import Experiment1
-from actors.tasks.reaching import Reaching
-from proto.action import ARM, FOCUS, GRASP, NECK
+from actors.tasks.experiment1.reaching import Reaching
+from actors.tasks.experiment1.task import Experiment1
+from proto.body import ARM, FOCUS, GRASP, NECK
 from proto.config import Config, SimulatorConfig
 from proto.episode import Kind, Reason
 from proto.errors import UserError

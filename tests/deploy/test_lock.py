@@ -10,7 +10,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-from services.doctor import LOCK, read_lock
+from services.machine.doctor import LOCK, read_lock
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
 LOCKED = read_lock(LOCK)

@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from proto.action import ACTION_VALUES
+from proto.body import ACTION_VALUES
 from proto.config import Config
 from proto.episode import Episode, Image
 

@@ -18,7 +18,7 @@ from learner.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from learner.subnets import parameter_shapes
+from learner.network.subnets import parameter_shapes
 from proto.config import NetworkConfig, SubnetConfig
 from proto.errors import UserError
 from proto.metrics import Stage

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from learner.checkpoint import load_checkpoint
-from learner.policy import NetworkPolicy
+from learner.network_policy import NetworkPolicy
 from learner.pretrained import PREFIX, checkpoint_path, pretrained_names
 from proto.errors import UserError
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from proto.config import Config
-from services.evaluation import trial_jobs
-from services.playing import play_all
+from services.playing.workers import play_all
+from services.trials.evaluation import trial_jobs
 
 
 def test_it_lifts_the_object_in_unlearned_situations() -> None:

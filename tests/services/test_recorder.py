@@ -20,7 +20,7 @@ from proto.episode import Episode, Kind
 from proto.keys import Role
 from proto.messages import Rollout
 from proto.metrics import RecorderMetrics
-from proto.recording import read_episode
+from proto.recordings.episodes import read_episode
 
 MakeEpisode = Callable[..., Episode]
 

@@ -18,7 +18,7 @@ from proto.episode import Kind
 from proto.keys import Role
 from proto.messages import Live, PolicyVersion
 from proto.metrics import METRICS, EvaluatorMetrics, LearnerMetrics, Metrics
-from proto.recording import read_episode
+from proto.recordings.episodes import read_episode
 
 FIRST_VERSIONS = 4
 ROUNDS = 1

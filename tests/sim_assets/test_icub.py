@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from proto.action import ACTION_VALUES, ARM, NECK
+from proto.body import ACTION_VALUES, ARM, NECK
 from sim_assets.hand import PHALANGES
 from sim_assets.icub import (
     ARM_JOINTS,

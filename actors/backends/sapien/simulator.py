@@ -24,7 +24,7 @@ from actors.simulator import (
     Scene,
     StepReport,
 )
-from proto.action import IMAGE_HEIGHT, IMAGE_WIDTH
+from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import SimulatorConfig
 from proto.errors import UserError
 from sim_assets.hand import joints_from_motors, motors_from_joints

@@ -6,13 +6,13 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from actors.policies import make_policy
-from actors.policy import StatefulPolicy
+from actors.policies.by_name import make_policy
+from actors.policies.contract import StatefulPolicy
 from proto.errors import UserError
-from proto.recording import read_episode
-from services.commands.figures.drawn import Drawn
-from services.commands.options import add_config, config_of
+from proto.recordings.episodes import read_episode
+from services.arguments.common import add_config, config_of
 from services.figures import activity
+from services.figures.drawn import Drawn
 
 SUMMARY: Final = "units and outputs of the network over time (paper, figure 4)"
 

@@ -11,14 +11,14 @@ from rich.console import Console
 
 from proto.errors import UserError
 from proto.seeds import TRIALS_BELOW
-from services import lap_trials
-from services.commands.figures.drawn import Drawn
-from services.commands.options import positive, seed
+from services.arguments.common import positive, seed
 from services.figures import corrections
 from services.figures.corrections import Curve
-from services.lap_trials import Run
-from services.progress import progress_bar
-from services.success import Tally
+from services.figures.drawn import Drawn
+from services.terminal.progress import progress_bar
+from services.trials import round_trials as lap_trials
+from services.trials.round_trials import Run
+from services.trials.success import Tally
 
 SUMMARY: Final = "success against the number of tutored cases, as policies are corrected"
 

@@ -9,11 +9,11 @@ from typing import Final
 
 from actors.tasks.registry import make_task
 from proto.errors import UserError
-from proto.recording import read_episode
-from services.commands.figures.drawn import Drawn
-from services.commands.options import add_config, config_of
+from proto.recordings.episodes import read_episode
+from services.arguments.common import add_config, config_of
 from services.figures import failures
-from services.trial_book import CountedTrial, read_trials
+from services.figures.drawn import Drawn
+from services.trials.trial_log import CountedTrial, read_trials
 
 SUMMARY: Final = "where a policy fails, and how it errs at the grasp"
 

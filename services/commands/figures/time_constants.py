@@ -6,12 +6,12 @@ import argparse
 from pathlib import Path
 from typing import Final
 
-from services.commands.figures.drawn import Drawn
-from services.commands.options import add_config, add_playing, playing_config
-from services.commands.sweeping import add_sweep, run_sweep
-from services.commands.training_options import add_training_data, training_stores
+from services.arguments.common import add_config, add_playing, playing_config
+from services.arguments.sweeping import add_sweep, run_sweep
+from services.arguments.training import add_training_data, training_stores
 from services.figures import time_constants
-from services.sweep import Variant
+from services.figures.drawn import Drawn
+from services.trials.sweeps import Variant
 
 SUMMARY: Final = "train and test networks by their PFC's time constant (paper, figure 5)"
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from learner.policy import NetworkPolicy
+from learner.network_policy import NetworkPolicy
 from proto.episode import Episode
 from proto.errors import UserError
-from proto.recording import read_episode, write_episode
+from proto.recordings.episodes import read_episode, write_episode
 from services.cli import main
 from services.figures.activity import UNITS_SHOWN, Activity, activity_of, difference_by_phase
 

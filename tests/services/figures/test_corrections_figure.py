@@ -11,13 +11,13 @@ from typing import Any
 import pytest
 
 from learner.checkpoint import policy_file
-from learner.offline import policy_is_due, write_policy
-from learner.store import TutoringStore
-from learner.training import Trainer
+from learner.training.trainer import Trainer
+from learner.training.training_run import policy_is_due, write_policy
+from learner.tutoring.store import TutoringStore
 from proto.config import Config
 from proto.episode import Kind
 from services.cli import main
-from services.lap_trials import open_run
+from services.trials.round_trials import open_run
 
 
 @pytest.fixture

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from actors.tasks.experiment1 import GRID, Experiment1
+from actors.tasks.experiment1.task import GRID, Experiment1
 from proto.episode import Outcome, Reason
 from proto.errors import UserError
 from services.cli import main
 from services.figures.failures import POSITION, YAW, Trials, numbers, snapping
-from services.trial_book import CountedTrial
+from services.trials.trial_log import CountedTrial
 
 Believes = Callable[[str, float], float]
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from learner.store import TutoringStore
+from learner.tutoring.store import TutoringStore
 from proto.config import Config, load_config
-from services import sweep
 from services.cli import main
-from services.success import Rate, difference95
+from services.trials import sweeps as sweep
+from services.trials.success import Rate, difference95
 
 QUICK = (
     "--set learner.pretraining.epochs=1 --set learner.epochs=2 --set learner.warmup_epochs=1"

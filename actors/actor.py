@@ -1,0 +1,295 @@
+"""The actor on the bus: plays what is asked for with the newest policy, and loses nothing."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from actors.player import LiveStep, play
+from actors.policies.by_name import make_tutor
+from actors.policies.contract import Policy
+from actors.policies.guided import GuidedPolicy
+from actors.simulator import make_simulator
+from actors.tasks.contract import Situation, Task
+from actors.tasks.registry import TASKS, make_task
+from learner.network_policy import NetworkPolicy
+from proto.bus import Bus
+from proto.codec import MessageError, encode
+from proto.config import Config
+from proto.episode import Episode, Kind
+from proto.errors import UserError
+from proto.membership import Lifecycle, every, membership
+from proto.messages import (
+    Correction,
+    Live,
+    PolicyVersion,
+    Receipt,
+    Rollout,
+    Sequence,
+    Trial,
+    TrialRequest,
+    TutoringCase,
+    TutoringRequest,
+)
+from proto.metrics import ActorMetrics
+from proto.outbox import Outbox
+from proto.pace import Pace
+from proto.seeds import PRACTICE
+
+LOG = logging.getLogger(__name__)
+
+IDLE_S: Final = 0.3
+OUTBOX_PERIOD_S: Final = 1.0
+OUTBOX_LIMIT: Final = 100
+"""With so many episodes without a receipt it plays no more for whom they are."""
+PRACTICE_LIMIT: Final = 8
+"""With so many rollouts without a receipt it does not practise."""
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """An episode to play.
+
+    Attributes:
+        kind: why.
+        task: what is played.
+        policy: who acts.
+        situation: in which situation.
+        seed: seed of the episode.
+    """
+
+    kind: Kind
+    task: Task
+    policy: Policy
+    situation: Situation
+    seed: int
+
+
+def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
+    """What is told to whoever watches, in every control step."""
+    return Live(
+        actor=actor,
+        kind=assignment.kind,
+        policy=assignment.policy.name,
+        policy_version=assignment.policy.version,
+        step=live.step,
+        phase=live.phase,
+        image=live.image,
+        joints_deg=live.joints_deg.astype(np.float32),
+        action=live.action.astype(np.float32),
+    )
+
+
+class _StoppedError(Exception):
+    """The episode is given up because the actor should stop."""
+
+
+class Actor:
+    """Takes newer policies between episodes only: a recurrent state never crosses a change."""
+
+    def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
+        """Make the simulator and find what a former process with this id left to be sent.
+
+        Raises:
+            UserError: the simulator cannot run on this machine.
+        """
+        self._config = config
+        self._bus = bus
+        self._lifecycle = lifecycle
+        self._digest = config.digest()
+        self._task = make_task(config.task)
+        self._tasks = {name: make(config.task.attention) for name, make in TASKS.items()}
+        self._simulator = make_simulator(config.simulator)
+        outbox = config.run_folder / "outbox" / bus.id
+        self._sequences = Outbox(outbox / "sequences", bus.deliver_wire)
+        self._rollouts = Outbox(outbox / "rollouts", bus.deliver_wire)
+        self._policy: NetworkPolicy | None = None
+        self._policy_run = ""
+        self._offered: PolicyVersion | None = None
+        self._offering = threading.Lock()
+        self._pace = Pace()
+        self._episodes = 0
+        self._last: Episode | None = None
+
+    def run(self) -> None:
+        """Play until it should stop; an episode that is going on then is given up."""
+        keys = self._bus.keys
+        self._bus.subscribe(keys.receipt(self._bus.id), self._on_receipt, Receipt)
+        self._bus.subscribe_newest(keys.policy, self._on_policy, PolicyVersion)
+        try:
+            with (
+                membership(self._bus, self, self._lifecycle),
+                every(OUTBOX_PERIOD_S, self._sequences.send_due),
+                every(OUTBOX_PERIOD_S, self._rollouts.send_due),
+            ):
+                while not self._lifecycle.stopping:
+                    self._play_next()
+        finally:
+            self._simulator.close()
+
+    def metrics(self) -> ActorMetrics:
+        """What it tells about itself."""
+        last = self._last
+        return ActorMetrics(
+            id=self._bus.id,
+            time_s=time.time(),
+            refused=self._bus.refused,
+            policy_version=self._policy.version if self._policy else 0,
+            steps_per_s=self._pace.per_second(),
+            episodes=self._episodes,
+            last_outcome=last.outcome.reason if last else None,
+            last_kind=last.kind if last else None,
+            backend=self._simulator.name,
+            outbox=self._waiting,
+            paused=self._lifecycle.paused,
+        )
+
+    def checkpoint(self) -> str:
+        """Nothing is to be saved: finished episodes are on disk until their receipts come."""
+        return f"{self._waiting} episodes wait for their receipts on disk"
+
+    @property
+    def _waiting(self) -> int:
+        return len(self._sequences) + len(self._rollouts)
+
+    def _play_next(self) -> None:
+        assignment = None
+        if not self._lifecycle.paused:
+            self._take_newest_policy()
+            assignment = self._tutoring() or self._trial() or self._practice()
+        if assignment is None:
+            self._lifecycle.wait(IDLE_S)
+            return
+        try:
+            episode = self._play(assignment)
+        except _StoppedError:
+            return
+        self._episodes += 1
+        self._last = episode
+        self._send(episode)
+
+    def _tutoring(self) -> Assignment | None:
+        """A case that the learner wants to be shown, or a situation to be guided in."""
+        if len(self._sequences) >= OUTBOX_LIMIT:
+            return None
+        version = self._policy.version if self._policy else 0
+        request = TutoringRequest(self._bus.id, self._policy_run, version)
+        key = self._bus.keys.request_tutoring
+        answers: list[TutoringCase | Correction]
+        answers = self._bus.ask(key, request, TutoringCase, Correction)
+        for answer in answers:
+            try:
+                if isinstance(answer, Correction):
+                    return self._guidance(answer)
+                return self._demonstration(answer)
+            except UserError as error:
+                LOG.warning("what the learner asks for is not played: %s", error)
+        return None
+
+    def _demonstration(self, asked: TutoringCase) -> Assignment:
+        """Show a tutored case; UserError if there is none such."""
+        task = self._task_called(asked.task)
+        situations = task.tutored()
+        if asked.case >= len(situations):
+            raise UserError(f"{asked.task} has no tutored case {asked.case}")
+        tutor = make_tutor(self._config, noisy=asked.repeat > 0)
+        return Assignment(Kind.TUTORING, task, tutor, situations[asked.case], asked.seed)
+
+    def _guidance(self, asked: Correction) -> Assignment:
+        """Guide the policy at hand; UserError if the situation cannot be."""
+        task = self._task_called(asked.task)
+        task.check(asked.situation)
+        if self._policy is None:
+            raise UserError("there is no policy to be guided")
+        tutor = make_tutor(self._config, noisy=False)
+        guided = GuidedPolicy(self._policy, tutor, self._config.tutor.guidance_deg)
+        return Assignment(Kind.CORRECTION, task, guided, asked.situation, asked.seed)
+
+    def _task_called(self, name: str) -> Task:
+        if name not in self._tasks:
+            raise UserError(f"no task is called {name!r}")
+        return self._tasks[name]
+
+    def _trial(self) -> Assignment | None:
+        """A trial of the policy at hand that the evaluator wants."""
+        if self._policy is None or len(self._rollouts) >= OUTBOX_LIMIT:
+            return None
+        request = TrialRequest(self._bus.id, self._policy_run, self._policy.version)
+        for trial in self._bus.ask(self._bus.keys.request_trial, request, Trial):
+            situation = self._task.sample(trial.seed)
+            return Assignment(Kind.TRIAL, self._task, self._policy, situation, trial.seed)
+        return None
+
+    def _practice(self) -> Assignment | None:
+        """A situation of its own choice."""
+        if self._policy is None or not self._config.actor.practice:
+            return None
+        if len(self._rollouts) >= PRACTICE_LIMIT:
+            return None
+        seed = secrets.choice(PRACTICE)
+        situation = self._task.sample(seed)
+        return Assignment(Kind.PRACTICE, self._task, self._policy, situation, seed)
+
+    def _play(self, assignment: Assignment) -> Episode:
+        live_key = self._bus.keys.live(self._bus.id)
+
+        def on_step(live: LiveStep) -> None:
+            if self._lifecycle.stopping:
+                raise _StoppedError
+            self._pace.add()
+            if self._config.actor.live and self._bus.watched(live_key):
+                message = live_message(self._bus.id, assignment, live)
+                self._bus.publish(live_key, message, check=False)
+
+        return play(
+            self._simulator,
+            assignment.task,
+            assignment.policy,
+            assignment.situation,
+            seed=assignment.seed,
+            kind=assignment.kind,
+            actor=self._bus.id,
+            config_digest=self._digest,
+            on_step=on_step,
+        )
+
+    def _send(self, episode: Episode) -> None:
+        keys, actor = self._bus.keys, self._bus.id
+        try:
+            if episode.kind in (Kind.TUTORING, Kind.CORRECTION):
+                self._sequences.add(episode.id, keys.sequence(actor), encode(Sequence(episode)))
+            else:
+                rollout = Rollout(episode, self._policy_run)
+                self._rollouts.add(episode.id, keys.rollout(actor), encode(rollout))
+        except MessageError as error:  # such as a simulation that blew up into NaN
+            LOG.warning("episode %s is dropped, nobody would take it: %s", episode.id, error)
+
+    def _on_receipt(self, receipt: Receipt) -> None:
+        self._sequences.received(receipt.episode)
+        self._rollouts.received(receipt.episode)
+
+    def _on_policy(self, offered: PolicyVersion) -> None:
+        with self._offering:
+            self._offered = offered
+
+    def _take_newest_policy(self) -> None:
+        with self._offering:
+            offered, self._offered = self._offered, None
+        if offered is None:
+            return
+        held = self._policy.version if self._policy and offered.run_id == self._policy_run else 0
+        if offered.version <= held:
+            return
+        try:
+            self._policy = NetworkPolicy.from_bytes(offered.weights)
+        except UserError as error:
+            LOG.warning("policy %d is not taken: %s", offered.version, error)
+            return
+        self._policy_run = offered.run_id
+        LOG.info("acts with policy %d from now on", self._policy.version)

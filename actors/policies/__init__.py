@@ -1,0 +1,1 @@
+"""What decides the robot's actions: the tutor, baselines and trained networks."""

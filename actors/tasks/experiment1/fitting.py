@@ -1,0 +1,349 @@
+"""Fits the tutor's key postures to the task.
+
+Run once, with `python -m actors.tasks.experiment1.fitting`.
+
+Inverse kinematics solved case by case jumps by tens of degrees between neighbouring cases, and a
+network cannot learn from that. So each key posture is a polynomial of the situation, and its
+coefficients are found by nonlinear least squares over a grid of situations at once: the hand where
+it should be, clear of everything it must not touch, within the joints' limits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib.resources import as_file
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.kinematics import Arm, ArmPose, Cuboid
+from actors.tasks.contract import Situation
+from actors.tasks.experiment1.postures import (
+    FITTED,
+    OBJECT_ORDERS,
+    OBSTACLE_ORDERS,
+    KeyPostures,
+    object_features,
+    obstacle_features,
+    travel,
+)
+from actors.tasks.experiment1.task import (
+    OBJECT_SIZE_M,
+    OBSTACLE_SIZE_M,
+    START,
+    TABLE_DROP_M,
+    object_pose,
+    obstacle_pose,
+)
+from proto.body import ARM
+from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
+
+Array = NDArray[np.float64]
+Residual = Callable[[Array, int], Array]
+
+# A residual of 1 is one of these: metres, radians.
+POSITION: Final = 0.001
+LOOSE_POSITION: Final = 0.01
+ANGLE: Final = np.deg2rad(1.0)
+CLEARANCE: Final = 0.002
+LIMIT: Final = np.deg2rad(0.5)
+
+OBJECT_MARGIN_M: Final = 0.006
+TABLE_MARGIN_M: Final = 0.004
+OBSTACLE_MARGIN_M: Final = 0.018
+PASSING_MARGIN_M: Final = 0.016
+DESCENT_M: Final = 0.085
+LIFT_M: Final = 0.11
+STEEPEST_APPROACH_RAD: Final = np.deg2rad(40.0)
+NEAREST_OBSTACLE: Final[Situation] = {"obstacle_x_m": -0.22}
+"""What is done at the object keeps clear of the obstacle wherever it stands."""
+
+
+def fit_polynomial(
+    features: Array, residual: Residual, start: Array, orders: Array, ridge: float = 1.0
+) -> Array:
+    """Levenberg-Marquardt for postures that are linear in `features`.
+
+    Args:
+        features: (N, K) monomials of N situations.
+        residual: residuals of a posture (7,) in radians in situation i.
+        start: (K, 7) coefficients to start from.
+        orders: (K,) order of each monomial; high orders are held small.
+        ridge: weight of that; 1 costs little accuracy and halves the steps from case to case.
+
+    Returns:
+        Coefficients (K, 7) in radians.
+    """
+    weight = (ridge * orders.astype(float) ** 1.5 / ANGLE / 10)[:, None] * np.ones(start.shape[1])
+    coefficients, damping = start, 1e-2
+    values, jacobians, cost = _linearize(features @ coefficients, residual)
+    cost += float(((weight * coefficients) ** 2).sum())
+    for _ in range(60):
+        hessian = np.diag((weight**2).ravel())
+        gradient = (weight**2 * coefficients).ravel()
+        for row, value, jacobian in zip(features, values, jacobians, strict=True):
+            hessian += np.kron(np.outer(row, row), jacobian.T @ jacobian)
+            gradient += np.kron(row, jacobian.T @ value)
+        improved = False
+        while damping < 1e6 and not improved:
+            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian) + 1e-6), -gradient)
+            trial = coefficients + step.reshape(coefficients.shape)
+            trial_values = [residual(q, i) for i, q in enumerate(features @ trial)]
+            trial_cost = sum(float(v @ v) for v in trial_values)
+            trial_cost += float(((weight * trial) ** 2).sum())
+            improved = trial_cost < cost
+            damping *= 0.2 if improved else 4.0
+        if not improved or cost - trial_cost < 1e-4 * cost:
+            return trial if improved else coefficients
+        coefficients = trial
+        values, jacobians, cost = _linearize(features @ coefficients, residual)
+        cost += float(((weight * coefficients) ** 2).sum())
+    return coefficients
+
+
+def _linearize(postures: Array, residual: Residual) -> tuple[list[Array], list[Array], float]:
+    values, jacobians = [], []
+    for i, posture in enumerate(postures):
+        value = residual(posture, i)
+        columns = [(residual(posture + shift, i) - value) / 1e-5 for shift in 1e-5 * np.eye(7)]
+        values.append(value)
+        jacobians.append(np.stack(columns, axis=1))
+    return values, jacobians, sum(float(value @ value) for value in values)
+
+
+def _short(distance: Array | float, margin: float) -> Array:
+    """How far distances fall short of a margin, in units of CLEARANCE."""
+    return np.asarray(np.maximum(0.0, margin - np.atleast_1d(distance)) / CLEARANCE)
+
+
+class PostureFitter:
+    """The residuals of each key posture, and the order in which they are fitted."""
+
+    def __init__(self) -> None:
+        """Set up the arm with the hand open, and the grids of situations."""
+        self._arm = Arm(OPEN_DEG, TABLE_DROP_M)
+        self._start = np.deg2rad(START[ARM])
+        self._objects = [
+            {"obstacle_x_m": -0.27, "object_y_m": float(y), "object_yaw_deg": float(yaw)}
+            for y in np.linspace(0.20, 0.30, 5)
+            for yaw in np.linspace(-45.0, 45.0, 9)
+        ]
+        self._obstacles = [
+            {"obstacle_x_m": float(x), "object_y_m": 0.25, "object_yaw_deg": 0.0}
+            for x in np.linspace(-0.32, -0.22, 5)
+        ]
+        self._object_features = np.array([object_features(s) for s in self._objects])
+        self._obstacle_features = np.array([obstacle_features(s) for s in self._obstacles])
+
+    def fit(self) -> KeyPostures:
+        """Fit all key postures; takes some seconds on one core."""
+        grasp = self._fit_grasp()
+        fitted = {"grasp": grasp}
+        below = grasp
+        for name, height in (
+            ("down_2", DESCENT_M / 3),
+            ("down_1", 2 * DESCENT_M / 3),
+            ("above", DESCENT_M),
+        ):
+            below = fitted[name] = self._fit_descent(grasp, below, height)
+        below = grasp
+        for name, height in (("lift_1", LIFT_M / 2), ("lift_2", LIFT_M)):
+            below = fitted[name] = self._fit_lift(grasp, below, height)
+        over = self._fit_over(fitted["above"])
+        beside = self._fit_beside(over)
+        return KeyPostures(
+            start=np.rad2deg(self._start),
+            object={name: np.rad2deg(rows) for name, rows in fitted.items()},
+            obstacle={"beside": np.rad2deg(beside), "over": np.rad2deg(over)},
+        )
+
+    def _limits(self, posture: Array) -> Array:
+        low, high = self._arm.minimum_rad, self._arm.maximum_rad
+        beyond = np.maximum(low - posture, posture - high) + LIMIT
+        return np.asarray(np.maximum(0.0, beyond) / LIMIT)
+
+    def _table(self, pose: ArmPose, margin: float = TABLE_MARGIN_M) -> Array:
+        return _short(pose.points_m[:, 2] - self._arm.radii_m, margin)
+
+    def _obstacle(self, pose: ArmPose, situation: Situation, margin: float) -> Array:
+        return _short(self._distances(pose, _obstacle_box(situation)), margin)
+
+    def _distances(self, pose: ArmPose, box: Cuboid) -> Array:
+        return np.asarray(box.distance(pose.points_m) - self._arm.radii_m)
+
+    def _fit_grasp(self) -> Array:
+        start = np.zeros((len(OBJECT_ORDERS), 7))
+        start[0] = np.deg2rad([-5.0, 25.0, 45.0, 70.0, -35.0, -45.0, 8.0])
+        centre = start[0].copy()
+
+        def residual(posture: Array, i: int) -> Array:
+            situation = self._objects[i]
+            pose = self._arm.pose(posture)
+            box = _object_box(situation)
+            across, along = box.level_axes()
+            offset = pose.rotation @ GRASP_CENTRE_M + pose.position_m - box.centre_m
+            axis = pose.rotation @ GRASP_AXIS
+            down = -(pose.rotation @ APPROACH_AXIS)[2]
+            return np.concatenate(
+                [
+                    [offset @ across / POSITION, offset @ along / (2.5 * POSITION)],
+                    [offset[2] / (3 * POSITION)],
+                    [axis @ along / ANGLE, axis[2] / (4 * ANGLE)],
+                    [max(0.0, np.cos(STEEPEST_APPROACH_RAD) - down) / (4 * ANGLE)],
+                    _short(self._distances(pose, box), OBJECT_MARGIN_M),
+                    self._table(pose),
+                    self._obstacle(pose, NEAREST_OBSTACLE, OBSTACLE_MARGIN_M),
+                    self._limits(posture),
+                    (posture - centre) / (60 * ANGLE),
+                ]
+            )
+
+        return fit_polynomial(self._object_features, residual, start, OBJECT_ORDERS)
+
+    def _fit_descent(self, grasp: Array, below: Array, height_m: float) -> Array:
+        """The open hand, raised straight above its grasp, turned the same way."""
+        grasps = [self._arm.pose(q) for q in self._object_features @ grasp]
+        before = self._object_features @ below
+        loose = 1.0 + 4.0 * height_m / DESCENT_M
+
+        def residual(posture: Array, i: int) -> Array:
+            pose = self._arm.pose(posture)
+            box = _object_box(self._objects[i])
+            across, along = box.level_axes()
+            target = box.centre_m + np.array([0.0, 0.0, height_m])
+            offset = pose.rotation @ GRASP_CENTRE_M + pose.position_m - target
+            axis = pose.rotation @ GRASP_AXIS
+            turned = (pose.rotation @ APPROACH_AXIS) - grasps[i].rotation @ APPROACH_AXIS
+            return np.concatenate(
+                [
+                    [offset @ across / (POSITION * loose), offset @ along / (2 * POSITION * loose)],
+                    [offset[2] / (2 * POSITION * loose)],
+                    [axis @ along / (ANGLE * loose), axis[2] / (4 * ANGLE * loose)],
+                    turned / (3 * ANGLE * loose),
+                    _short(self._distances(pose, box), OBJECT_MARGIN_M),
+                    self._table(pose),
+                    self._obstacle(pose, NEAREST_OBSTACLE, OBSTACLE_MARGIN_M),
+                    self._limits(posture),
+                    (posture - before[i]) / (15 * ANGLE),
+                ]
+            )
+
+        return fit_polynomial(self._object_features, residual, below, OBJECT_ORDERS)
+
+    def _fit_lift(self, grasp: Array, below: Array, height_m: float) -> Array:
+        """The grasped object raised, held level enough, free to drift sideways a little."""
+        grasps = [self._arm.pose(q) for q in self._object_features @ grasp]
+        before = self._object_features @ below
+
+        def residual(posture: Array, i: int) -> Array:
+            pose = self._arm.pose(posture)
+            lifted = pose.rotation @ GRASP_CENTRE_M + pose.position_m
+            centre = grasps[i].rotation @ GRASP_CENTRE_M + grasps[i].position_m
+            offset = lifted - centre - np.array([0.0, 0.0, height_m])
+            return np.concatenate(
+                [
+                    offset / [3 * LOOSE_POSITION, 3 * LOOSE_POSITION, 3 * POSITION],
+                    ((pose.rotation - grasps[i].rotation) / (10 * ANGLE)).ravel(),
+                    self._table(pose),
+                    self._obstacle(pose, NEAREST_OBSTACLE, 2 * OBSTACLE_MARGIN_M),
+                    self._limits(posture),
+                    (posture - before[i]) / (10 * ANGLE),
+                ]
+            )
+
+        return fit_polynomial(self._object_features, residual, below, OBJECT_ORDERS)
+
+    def _fit_over(self, above: Array) -> Array:
+        """The hand just above the obstacle, with a clear way on to above the object."""
+        middle = object_features(self._objects[len(self._objects) // 2]) @ above
+        corners = [
+            object_features({"object_y_m": y, "object_yaw_deg": yaw}) @ above
+            for y in (0.20, 0.30)
+            for yaw in (-45.0, 0.0, 45.0)
+        ]
+        start = np.zeros((len(OBSTACLE_ORDERS), 7))
+        start[0] = middle
+        raised = np.deg2rad([-10.0, 35.0, 0.0, 10.0, 0.0, 0.0, 0.0])
+        start[0] += raised
+
+        def residual(posture: Array, i: int) -> Array:
+            situation = self._obstacles[i]
+            box = _obstacle_box(situation)
+            pose = self._arm.pose(posture)
+            hand = pose.position_m + pose.rotation @ GRASP_CENTRE_M
+            on_the_way = [
+                self._obstacle(self._arm.pose(between), situation, PASSING_MARGIN_M)
+                for corner in corners
+                for between in travel([posture, corner], np.array([0.1, 0.2, 0.35, 0.5, 0.75]))
+            ]
+            lowest = float((pose.points_m[:, 2] - self._arm.radii_m)[self._arm.of_hand].min())
+            return np.concatenate(
+                [
+                    [(hand[0] - box.centre_m[0]) / LOOSE_POSITION],
+                    [(hand[1] - 0.24) / (2 * LOOSE_POSITION)],
+                    [(lowest - OBSTACLE_SIZE_M[2] - OBSTACLE_MARGIN_M) / (2 * POSITION)],
+                    self._obstacle(pose, situation, OBSTACLE_MARGIN_M),
+                    *on_the_way,
+                    self._limits(posture),
+                    (posture - middle) / (20 * ANGLE),
+                ]
+            )
+
+        return fit_polynomial(self._obstacle_features, residual, start, OBSTACLE_ORDERS)
+
+    def _fit_beside(self, over: Array) -> Array:
+        """The hand close beside the obstacle, on the right of it, on its way up."""
+        after = self._obstacle_features @ over
+
+        def residual(posture: Array, i: int) -> Array:
+            situation = self._obstacles[i]
+            box = _obstacle_box(situation)
+            pose = self._arm.pose(posture)
+            hand = pose.position_m + pose.rotation @ GRASP_CENTRE_M
+            leftmost = float((pose.points_m[:, 0] - self._arm.radii_m)[self._arm.of_hand].min())
+            way = travel([self._start, posture, after[i]], np.linspace(0.05, 0.95, 19))
+            on_the_way = [
+                part
+                for between in way
+                for part in (
+                    self._obstacle(self._arm.pose(between), situation, PASSING_MARGIN_M),
+                    self._limits(between),
+                )
+            ]
+            return np.concatenate(
+                [
+                    [(leftmost - box.centre_m[0] - 0.005 - OBSTACLE_MARGIN_M) / (2 * POSITION)],
+                    [(hand[1] - 0.24) / (3 * LOOSE_POSITION)],
+                    [(hand[2] - 0.16) / LOOSE_POSITION],
+                    self._obstacle(pose, situation, OBSTACLE_MARGIN_M),
+                    *on_the_way,
+                    self._table(pose, 0.02),
+                    self._limits(posture),
+                    (posture - 0.5 * (after[i] + self._start)) / (20 * ANGLE),
+                ]
+            )
+
+        return fit_polynomial(self._obstacle_features, residual, over, OBSTACLE_ORDERS)
+
+
+def _object_box(situation: Situation) -> Cuboid:
+    pose = object_pose(situation)
+    yaw = np.deg2rad(-situation["object_yaw_deg"])
+    return Cuboid(np.array(pose.position_m), np.array(OBJECT_SIZE_M), float(yaw))
+
+
+def _obstacle_box(situation: Situation) -> Cuboid:
+    return Cuboid(np.array(obstacle_pose(situation).position_m), np.array(OBSTACLE_SIZE_M))
+
+
+def main() -> None:
+    """Fit all key postures and write them where `load_key_postures` finds them."""
+    text = PostureFitter().fit().to_json()
+    with as_file(FITTED) as path:
+        path.write_text(text)
+    print(f"wrote {FITTED}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,97 @@
+"""Key postures of the tutor as polynomials of the situation.
+
+Each key posture is a low-order polynomial of what it depends on, so that neighbouring situations
+give neighbouring trajectories. `actors.tasks.experiment1.fitting` found the coefficients.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from actors.tasks.contract import Situation
+
+Array = NDArray[np.float64]
+
+OBJECT_POSTURES: Final = ("above", "down_1", "down_2", "grasp", "lift_1", "lift_2")
+"""Postures that depend on where the object lies and how it is turned."""
+OBSTACLE_POSTURES: Final = ("beside", "over")
+"""Postures that depend on where the obstacle stands."""
+
+_OBJECT_POWERS: Final = tuple((y, yaw) for y in range(3) for yaw in range(4))
+_OBSTACLE_POWERS: Final = (0, 1, 2)
+
+
+def object_features(situation: Situation) -> Array:
+    """Monomials (12,) of the object's Y and yaw, both scaled to -1..1 over the ranges."""
+    y = (situation["object_y_m"] - 0.25) / 0.05
+    yaw = situation["object_yaw_deg"] / 45.0
+    return np.array([y**a * yaw**b for a, b in _OBJECT_POWERS])
+
+
+def obstacle_features(situation: Situation) -> Array:
+    """Monomials (3,) of the obstacle's X, scaled to -1..1 over its range."""
+    x = (situation["obstacle_x_m"] + 0.27) / 0.05
+    return np.array([x**power for power in _OBSTACLE_POWERS])
+
+
+OBJECT_ORDERS: Final = np.array([a + b for a, b in _OBJECT_POWERS])
+OBSTACLE_ORDERS: Final = np.array(_OBSTACLE_POWERS)
+
+
+@dataclass(frozen=True)
+class KeyPostures:
+    """The fitted key postures of Experiment I.
+
+    Attributes:
+        start: (7,) arm posture that every episode starts from, in degrees.
+        object: coefficients (12, 7) in degrees of each posture in OBJECT_POSTURES.
+        obstacle: coefficients (3, 7) in degrees of each posture in OBSTACLE_POSTURES.
+    """
+
+    start: Array
+    object: dict[str, Array]
+    obstacle: dict[str, Array]
+
+    def arm_deg(self, name: str, situation: Situation) -> Array:
+        """Arm posture (7,) in degrees of a key posture in a situation."""
+        if name in self.object:
+            return np.asarray(object_features(situation) @ self.object[name])
+        return np.asarray(obstacle_features(situation) @ self.obstacle[name])
+
+    def to_json(self) -> str:
+        """Text from which `load_key_postures` reads the postures back."""
+        values = {
+            "start": self.start.round(4).tolist(),
+            "object": {name: rows.round(4).tolist() for name, rows in self.object.items()},
+            "obstacle": {name: rows.round(4).tolist() for name, rows in self.obstacle.items()},
+        }
+        return json.dumps(values, indent=1) + "\n"
+
+
+def travel(postures: Sequence[Array], share: Array | float) -> Array:
+    """A smooth way through postures (each (7,)), evenly spaced over shares 0..1; (..., 7)."""
+    way = CubicSpline(np.linspace(0.0, 1.0, len(postures)), np.stack(postures))
+    return np.asarray(way(share))
+
+
+FITTED: Final = files("actors.tasks.experiment1").joinpath("postures.json")
+
+
+@cache
+def load_key_postures() -> KeyPostures:
+    """The postures that were fitted once and lie beside this module; read once."""
+    values = json.loads(FITTED.read_text())
+    return KeyPostures(
+        start=np.array(values["start"]),
+        object={name: np.array(values["object"][name]) for name in OBJECT_POSTURES},
+        obstacle={name: np.array(values["obstacle"][name]) for name in OBSTACLE_POSTURES},
+    )

@@ -1,0 +1,1 @@
+"""How fast training is, and the step-by-step reference that it is measured against."""

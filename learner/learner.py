@@ -1,0 +1,307 @@
+"""The learner on the bus: asks for sequences, keeps them, trains, publishes policies."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from learner.checkpoint import load_checkpoint, policy_file, pretraining_file, training_file
+from learner.training.training_run import (
+    open_training,
+    policy_is_due,
+    pretraining_is_over,
+    write_policy,
+)
+from learner.tutoring.corrections import Round, Situations
+from learner.tutoring.curriculum import Curriculum
+from learner.tutoring.store import TutoringStore
+from proto.bus import Bus, Inbox
+from proto.config import Config
+from proto.episode import Episode
+from proto.keys import Role
+from proto.membership import Lifecycle, alone_in_run, membership
+from proto.messages import (
+    Correction,
+    PolicyVersion,
+    Receipt,
+    Sequence,
+    TutoringCase,
+    TutoringRequest,
+    Verdict,
+)
+from proto.metrics import LearnerMetrics, Stage
+from proto.pace import Pace
+from proto.storage import written_whole
+
+LOG = logging.getLogger(__name__)
+
+WAITING: Final = 64
+"""Sequences that may wait to be kept; more are dropped, and sent again by their actors."""
+IDLE_S: Final = 0.2
+_TRAINING: Final = (Stage.PRETRAINING, Stage.COUPLED)
+
+
+@dataclass(frozen=True)
+class _Material:
+    """What a stage learns from.
+
+    Attributes:
+        store: its sequences.
+        start_with: so many of them are enough to start.
+    """
+
+    store: TutoringStore
+    start_with: int
+
+    @property
+    def enough(self) -> bool:
+        return len(self.store) >= self.start_with
+
+
+class Learner:
+    """Restores first, publishes second: what it published before a restart it still knows.
+
+    Sequences come in, and cases are handed out, while it trains.
+    """
+
+    def __init__(
+        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, tasks: Mapping[str, Situations]
+    ) -> None:
+        """Restore what is in the run's folder.
+
+        Args:
+            config: the configuration of the run.
+            bus: connection to the others.
+            lifecycle: when to pause and to stop.
+            tasks: the situations of each task, by name.
+
+        Raises:
+            UserError: the folder holds a training that cannot go on, or the configuration asks for
+                a case that there is not.
+        """
+        self._config = config
+        self._bus = bus
+        self._lifecycle = lifecycle
+        self._folder = config.run_folder
+        tutored_cases = {name: len(task.tutored()) for name, task in tasks.items()}
+        self._curriculum = Curriculum(config, tutored_cases)
+        self._situations = tasks[config.task.name]
+        self._stores = _stores(config)
+        self._materials = self._make_materials()
+        self._trainer = open_training(
+            config,
+            self._folder,
+            self._materials[Stage.COUPLED].store,
+            self._materials[Stage.PRETRAINING].store,
+            rounds=config.learner.corrections.rounds,
+        )
+        self._training = threading.Lock()  # held while the trainer changes or is written to disk
+        self._run_id = _run_id(self._folder)
+        self._round = self._make_round()
+        for store in self._stores.values():
+            for episode in filter(None, map(store.load, store.ids)):
+                self._note(episode)
+        self._pace = Pace()
+
+    def run(self) -> None:
+        """Learn until it should stop, then save.
+
+        Raises:
+            UserError: the run has a learner already, the training diverged, or the disk is full.
+        """
+        alone_in_run(self._bus, self._lifecycle)
+        self._config.save(self._folder / "config.yaml")
+        self._publish()
+        inbox = self._open_doors()
+        with membership(self._bus, self, self._lifecycle):
+            while not self._lifecycle.stopping:
+                may_train = self._may_train
+                self._receive(inbox, wait_s=0.0 if may_train else IDLE_S)
+                if may_train:
+                    self._train()
+        LOG.info(self.checkpoint())
+
+    def metrics(self) -> LearnerMetrics:
+        """What it tells about itself."""
+        done, awaited = self._config.done, self._round
+        return LearnerMetrics(
+            id=self._bus.id,
+            time_s=time.time(),
+            refused=self._bus.refused,
+            stage=self._stage,
+            epoch=self._trainer.epochs_done,
+            epochs_total=self._trainer.epochs_total,
+            loss=self._trainer.loss,
+            sequences=self._sequences,
+            round=self._trainer.round,
+            corrections=awaited.kept if awaited else 0,
+            corrections_total=awaited.most if awaited else 0,
+            epochs_per_s=self._pace.per_second(),
+            policy_version=self._trainer.version,
+            paused=self._lifecycle.paused,
+            done=done.ever and self._trainer.version >= (done.policy_versions or 0),
+        )
+
+    def checkpoint(self) -> str:
+        """Save the training, after the epoch that is going on."""
+        path = training_file(self._folder)
+        with self._training:
+            self._trainer.save(path)
+            return f"saved {self._trainer.stage} epoch {self._trainer.epochs_done} to {path}"
+
+    @property
+    def _sequences(self) -> int:
+        return sum(map(len, self._stores.values()))
+
+    @property
+    def _stage(self) -> Stage:
+        awaited, material = self._round, self._materials.get(self._trainer.next_stage)
+        waiting = material is not None and not material.enough
+        if awaited is not None:
+            waiting = not awaited.complete
+        return Stage.WAITING if waiting else self._trainer.stage
+
+    @property
+    def _may_train(self) -> bool:
+        return self._stage in _TRAINING and not self._lifecycle.paused
+
+    def _make_materials(self) -> Mapping[Stage, _Material]:
+        """What coupled training and pre-training learn from."""
+        learner, sizes = self._config.learner, self._curriculum.sizes
+        task, first = self._config.task.name, self._config.pretraining_task
+        coupled = _Material(self._stores[task], min(learner.start_sequences, sizes[task]))
+        pretraining = coupled
+        if first is not None:
+            enough = min(learner.pretraining.start_sequences, sizes[first])
+            pretraining = _Material(self._stores[first], enough)
+        return {Stage.COUPLED: coupled, Stage.PRETRAINING: pretraining}
+
+    def _open_doors(self) -> Inbox[Sequence]:
+        """From now on sequences are received and cases handed out."""
+        keys = self._bus.keys
+        self._bus.answer(keys.request_tutoring, TutoringRequest, self._hand_out)
+        self._bus.subscribe(keys.verdict, self._on_verdict, Verdict)
+        self._bus.watch_presence(Role.ACTOR, self._on_presence)
+        return self._bus.inbox(keys.sequence(), Sequence, capacity=WAITING)
+
+    def _hand_out(self, request: TutoringRequest) -> TutoringCase | Correction | None:
+        if self._lifecycle.paused:
+            return None
+        case, awaited = self._curriculum.next_case(request.actor), self._round
+        if case is not None or awaited is None:
+            return case
+        return awaited.next_correction(request)
+
+    def _on_verdict(self, verdict: Verdict) -> None:
+        if (awaited := self._round) is not None:
+            awaited.judge(verdict)
+
+    def _on_presence(self, actor: str, alive: bool) -> None:
+        if alive:
+            return
+        self._curriculum.release(actor)
+        if (awaited := self._round) is not None:
+            awaited.release(actor)
+
+    def _receive(self, inbox: Inbox[Sequence], wait_s: float) -> None:
+        while (sequence := inbox.take(timeout_s=wait_s)) is not None:
+            episode = sequence.episode
+            if self._wants(episode):
+                self._stores[episode.task].add(episode)
+                self._note(episode)
+                LOG.info("kept a %s sequence, %d in all", episode.kind, self._sequences)
+            # One that is not wanted, such as the second of a case, need not be sent again either.
+            self._bus.deliver(self._bus.keys.receipt(episode.actor), Receipt(episode.id))
+            wait_s = 0.0
+
+    def _wants(self, episode: Episode) -> bool:
+        """Whether a case or the round of corrections lacks this episode."""
+        awaited = self._round
+        return self._curriculum.wants(episode) or (awaited is not None and awaited.wants(episode))
+
+    def _note(self, episode: Episode) -> None:
+        """This episode is kept: it is not wanted any more."""
+        self._curriculum.shown([episode])
+        if self._round is not None:
+            self._round.shown(episode)
+
+    def _make_round(self) -> Round | None:
+        """The round of corrections that the next epoch has to wait for, if it is a lap's first."""
+        if not self._trainer.round_begins:
+            return None
+        newest = self._run_id, self._trainer.version
+        return Round(self._config, self._trainer.round, newest, self._situations)
+
+    def _end_round(self) -> None:
+        """All corrections of the round are there; what else comes in is for none."""
+        if self._round is not None:
+            LOG.info(
+                "round %d is over: %d corrections, %d episodes of practice judged",
+                self._round.number,
+                self._round.kept,
+                self._round.judged,
+            )
+            self._round = None
+
+    def _train(self) -> None:
+        self._end_round()
+        with self._training:
+            self._trainer.epoch()
+            over = pretraining_is_over(self._trainer)
+            if over:
+                self._trainer.save(pretraining_file(self._folder))
+        self._pace.add()
+        if policy_is_due(self._trainer, self._config.learner):
+            with self._training:
+                write_policy(self._trainer, self._folder)
+            # the training on disk knows of a version before anyone else does
+            LOG.info(self.checkpoint())
+            self._round = self._make_round()
+            self._publish()
+        elif over or self._trainer.epochs_done % self._config.learner.checkpoint_every_epochs == 0:
+            LOG.info(self.checkpoint())
+
+    def _publish(self) -> None:
+        """Publish the newest policy there is, if there is one."""
+        version = self._trainer.version
+        if version == 0:
+            return
+        path = policy_file(self._folder, version)
+        metadata = load_checkpoint(path).metadata
+        self._bus.publish_newest(
+            self._bus.keys.policy,
+            PolicyVersion(
+                run_id=self._run_id,
+                version=version,
+                epoch=metadata.epoch,
+                loss=metadata.loss or 0.0,
+                config_digest=metadata.config_digest,
+                weights=path.read_bytes(),
+            ),
+        )
+        LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
+
+
+def _stores(config: Config) -> Mapping[str, TutoringStore]:
+    """Where the sequences of each task are kept."""
+    folders = {config.task.name: "tutoring"}
+    if config.pretraining_task is not None:
+        folders[config.pretraining_task] = "pretraining"
+    return {task: TutoringStore(config.run_folder / name) for task, name in folders.items()}
+
+
+def _run_id(folder: Path) -> str:
+    """Id of the training in a folder; a training that starts anew gets a new one."""
+    path = training_file(folder).with_name("run_id")
+    if training_file(folder).exists() and path.exists():
+        return path.read_text()
+    run_id = secrets.token_hex(8)
+    with written_whole(path) as stream:
+        stream.write(run_id.encode())
+    return run_id

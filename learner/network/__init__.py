@@ -1,0 +1,1 @@
+"""The network VMDNN: its subnets, its outputs' code, and the form that acts."""

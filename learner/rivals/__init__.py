@@ -1,0 +1,1 @@
+"""Networks of other kinds that VMDNN is compared with."""

@@ -1,0 +1,1 @@
+"""Training: pre-training of the vision, coupled training, and what both need."""

@@ -1,0 +1,339 @@
+"""Episodes on disk: one MCAP file each, lossless, that Foxglove opens.
+
+| topic | schema | what |
+|---|---|---|
+| `/eye` | foxglove.CompressedImage | images[t] as PNG |
+| `/joints` | foxglove.JointStates | joints_deg[t], in radians as the schema asks |
+| `/tf` | foxglove.FrameTransforms | body_poses[t], each body a frame in `world` |
+| `/states` | vmdnn.States | states[t] of each subnet; only where they were asked for |
+| `/step` | vmdnn.Step | phases[t], actions[t], targets[t], outputs[t]; ends step t |
+
+Step t is logged at t control periods. Everything else stands in three metadata records before
+the first message: `episode`, `situation` and `outcome`.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from google.protobuf.message import DecodeError
+from mcap.exceptions import InvalidMagic, McapError
+from mcap.records import Channel, McapRecord, Metadata
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from numpy.typing import NDArray
+from zstandard import ZstdError
+
+from proto.body import ACTION_NAMES, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
+from proto.episode import Episode, Floats, Image, Kind, Outcome, Reason
+from proto.errors import UserError
+from proto.recordings.schemas import (
+    CompressedImage,
+    FrameTransforms,
+    JointStates,
+    Message,
+    States,
+    Step,
+    describe,
+)
+from proto.storage import written_whole
+
+FORMAT: Final = "1"
+EYE: Final = "/eye"
+JOINTS: Final = "/joints"
+TRANSFORMS: Final = "/tf"
+STATES: Final = "/states"
+STEP: Final = "/step"
+TOPICS: Final[Mapping[str, type[Message]]] = {
+    EYE: CompressedImage,
+    JOINTS: JointStates,
+    TRANSFORMS: FrameTransforms,
+    STEP: Step,
+}
+
+# A kill while an episode is written costs at most one chunk, some ten steps.
+CHUNK_BYTES: Final = 64 * 1024
+DAMAGE: Final = (
+    McapError,
+    ZstdError,
+    struct.error,
+    ValueError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+)
+"""What reading the records of a file that is cut off, or damaged otherwise, raises."""
+
+
+def write_episode(path: Path, episode: Episode) -> None:
+    """Write an episode; the file appears under its name only once it is whole.
+
+    Raises:
+        UserError: the file cannot be written there.
+    """
+    with written_whole(path) as stream:
+        writer = Writer(stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
+        writer.start(profile="vmdnn", library="vmdnn")
+        writer.add_metadata("episode", _episode_texts(episode))
+        writer.add_metadata("situation", {k: json.dumps(v) for k, v in episode.situation.items()})
+        writer.add_metadata("outcome", _outcome_texts(episode.outcome))
+        topics = dict(TOPICS) if episode.states is None else {**TOPICS, STATES: States}
+        channels = {topic: _register(writer, topic, schema) for topic, schema in topics.items()}
+        for step in range(episode.steps):
+            time_ns = round(step * episode.control_period_s * 1e9)
+            for topic, message in _messages(episode, step, time_ns):
+                data = message.SerializeToString()
+                writer.add_message(channels[topic], time_ns, data, time_ns, sequence=step)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def read_episode(path: Path, *, partial: bool = False) -> Episode:
+    """Read an episode that `write_episode` wrote.
+
+    Args:
+        path: the MCAP file.
+        partial: accept what `vmdnn recover` saved of a file that was cut off. Such an episode has
+            fewer steps than were played; its outcome is the one it had when it was whole.
+
+    Raises:
+        UserError: the file is missing, cut off, damaged, no episode, or recovered in part.
+    """
+    contents = _contents(path)
+    try:
+        expected = int(contents.metadata["episode"]["steps"])
+        episode = _episode(contents)
+    except (KeyError, ValueError, TypeError, AttributeError, DecodeError) as error:
+        raise UserError(
+            f"{path} is an MCAP file, but no episode that this version can read ({error!r})"
+        ) from error
+    if episode.steps != expected and not partial:
+        raise UserError(
+            f"{path} holds {episode.steps} of {expected} steps, recovered from a file that was cut "
+            f"off. `vmdnn replay` can show it; for training or counting, play the episode again."
+        )
+    return episode
+
+
+def records(path: Path) -> Iterator[McapRecord]:
+    """All records of an MCAP file in order, chunks unpacked, checksums checked.
+
+    Raises:
+        UserError: there is no such file, or it is of another format.
+        one of DAMAGE: after the last whole record, unless the file is whole.
+    """
+    try:
+        with path.open("rb") as stream:
+            size = path.stat().st_size
+            yield from StreamReader(stream, validate_crcs=True, record_size_limit=size).records
+    except InvalidMagic as error:
+        raise UserError(f"{path} is not an MCAP file") from error
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+
+
+@dataclass(frozen=True)
+class _Contents:
+    """Metadata by name, and the messages of each topic in order."""
+
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    messages: dict[str, list[bytes]] = field(default_factory=lambda: defaultdict(list))
+
+
+def _contents(path: Path) -> _Contents:
+    contents = _Contents()
+    topics: dict[int, str] = {}
+    try:
+        for record in records(path):
+            if isinstance(record, McapMessage):
+                contents.messages[topics[record.channel_id]].append(record.data)
+            elif isinstance(record, Channel):
+                topics[record.id] = record.topic
+            elif isinstance(record, Metadata):
+                contents.metadata[record.name] = record.metadata
+    except DAMAGE as error:
+        raise UserError(
+            f"{path} is cut off or damaged; run `vmdnn recover {path}` to save what is whole of it"
+        ) from error
+    return contents
+
+
+def _register(writer: Writer, topic: str, schema: type[Message]) -> int:
+    name = schema.DESCRIPTOR.full_name
+    schema_id = writer.register_schema(name, "protobuf", describe(schema))
+    return writer.register_channel(topic, "protobuf", schema_id)
+
+
+def _messages(episode: Episode, step: int, time_ns: int) -> Iterator[tuple[str, Message]]:
+    eye = CompressedImage(format="png", frame_id="left_eye", data=_png(episode.images[step]))
+    joints = JointStates()
+    for name, angle in zip(JOINT_NAMES, _radians(episode.joints_deg[step]), strict=True):
+        joints.joints.add(name=name, position=angle)
+    transforms = FrameTransforms()
+    for name, pose in zip(episode.body_names, episode.body_poses[step].tolist(), strict=True):
+        transform = transforms.transforms.add(parent_frame_id="world", child_frame_id=name)
+        transform.timestamp.FromNanoseconds(time_ns)
+        at, turn = transform.translation, transform.rotation
+        at.x, at.y, at.z, turn.w, turn.x, turn.y, turn.z = pose
+    told = Step(
+        step=step,
+        phase=int(episode.phases[step]),
+        action=dict(zip(ACTION_NAMES, episode.actions[step].tolist(), strict=True)),
+        target=dict(zip(ACTION_NAMES, episode.targets[step].tolist(), strict=True)),
+        outputs=[] if episode.outputs is None else episode.outputs[step].tolist(),
+    )
+    eye.timestamp.FromNanoseconds(time_ns)
+    joints.timestamp.FromNanoseconds(time_ns)
+    yield from ((EYE, eye), (JOINTS, joints), (TRANSFORMS, transforms))
+    if episode.states is not None:
+        states = States()
+        for name, activity in episode.states.items():
+            states.subnets.add(name=name, activity=activity[step].tolist())
+        yield STATES, states
+    yield STEP, told
+
+
+def _episode(contents: _Contents) -> Episode:
+    told = contents.metadata["episode"]
+    if told["format"] != FORMAT:
+        raise ValueError(f"format {told['format']}, not {FORMAT}")
+    names = tuple(json.loads(told["body_names"]))
+    # `/step` ends a step, so each of its messages stands for a whole one.
+    steps = [Step.FromString(data) for data in contents.messages[STEP]]
+    count = len(steps)
+    outputs_size = json.loads(told["outputs"])
+    return Episode(
+        id=told["id"],
+        kind=Kind(told["kind"]),
+        task=told["task"],
+        situation={k: json.loads(v) for k, v in contents.metadata["situation"].items()},
+        seed=int(told["seed"]),
+        actor=told["actor"],
+        backend=told["backend"],
+        policy=told["policy"],
+        policy_version=int(told["policy_version"]),
+        config_digest=told["config_digest"],
+        images=_images(contents.messages[EYE][:count]),
+        actions=_floats([_action(step.action) for step in steps], (count, len(ACTION_NAMES))),
+        targets=_floats([_action(step.target) for step in steps], (count, len(ACTION_NAMES))),
+        joints_deg=_joints_deg(contents.messages[JOINTS][:count]),
+        phases=np.array([step.phase for step in steps], dtype=np.uint8),
+        body_names=names,
+        body_poses=_poses(contents.messages[TRANSFORMS][:count], len(names)),
+        outcome=_outcome(contents.metadata["outcome"]),
+        outputs=None
+        if outputs_size is None
+        else _floats([step.outputs for step in steps], (count, outputs_size)),
+        control_period_s=float(told["control_period_s"]),
+        states=_states(contents.messages[STATES][:count], json.loads(told.get("states", "null"))),
+    )
+
+
+def _episode_texts(episode: Episode) -> dict[str, str]:
+    return {
+        "format": FORMAT,
+        "id": episode.id,
+        "kind": episode.kind.value,
+        "task": episode.task,
+        "seed": str(episode.seed),
+        "actor": episode.actor,
+        "backend": episode.backend,
+        "policy": episode.policy,
+        "policy_version": str(episode.policy_version),
+        "config_digest": episode.config_digest,
+        "control_period_s": repr(episode.control_period_s),
+        "steps": str(episode.steps),
+        **_states_text(episode),
+        "outputs": json.dumps(None if episode.outputs is None else episode.outputs.shape[1]),
+        "body_names": json.dumps(episode.body_names),
+    }
+
+
+def _states_text(episode: Episode) -> dict[str, str]:
+    """Number of units by subnet; nothing where no states are kept, as before there were any."""
+    if episode.states is None:
+        return {}
+    units = {name: activity.shape[1] for name, activity in episode.states.items()}
+    return {"states": json.dumps(units)}
+
+
+def _outcome_texts(outcome: Outcome) -> dict[str, str]:
+    texts = {item.name: json.dumps(getattr(outcome, item.name)) for item in fields(Outcome)}
+    return texts | {"reason": outcome.reason.value}
+
+
+def _outcome(texts: Mapping[str, str]) -> Outcome:
+    values: dict[str, Any] = {
+        item.name: json.loads(texts[item.name]) for item in fields(Outcome) if item.name != "reason"
+    }
+    return Outcome(reason=Reason(texts["reason"]), **values)
+
+
+def _png(image: Image) -> bytes:
+    whole, data = cv2.imencode(".png", image)
+    if not whole:
+        raise ValueError(f"an image of shape {image.shape} cannot be made into a PNG")
+    return bytes(data)
+
+
+def _images(messages: Sequence[bytes]) -> Image:
+    images = np.empty((len(messages), IMAGE_HEIGHT, IMAGE_WIDTH), dtype=np.uint8)
+    for step, data in enumerate(messages):
+        png = np.frombuffer(CompressedImage.FromString(data).data, dtype=np.uint8)
+        image = cv2.imdecode(png, cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise ValueError(f"the picture of step {step} is no PNG")
+        images[step] = image
+    return images
+
+
+def _states(messages: Sequence[bytes], units: Mapping[str, int] | None) -> dict[str, Floats] | None:
+    if units is None:
+        return None
+    rows: dict[str, list[Sequence[float]]] = {name: [] for name in units}
+    for data in messages:
+        for subnet in States.FromString(data).subnets:
+            rows[subnet.name].append(subnet.activity)
+    return {name: _floats(rows[name], (len(messages), size)) for name, size in units.items()}
+
+
+def _radians(joints_deg: Floats) -> list[float]:
+    # In float64, so that rounding to float32 after the way back gives the very same degrees.
+    radians: list[float] = np.radians(joints_deg.astype(np.float64)).tolist()
+    return radians
+
+
+def _joints_deg(messages: Sequence[bytes]) -> Floats:
+    radians = [
+        [joint.position for joint in JointStates.FromString(data).joints] for data in messages
+    ]
+    return np.degrees(_array(radians, (len(messages), len(JOINT_NAMES)))).astype(np.float32)
+
+
+def _action(action: Any) -> list[float]:
+    return [getattr(action, name) for name in ACTION_NAMES]
+
+
+def _poses(messages: Sequence[bytes], bodies: int) -> Floats:
+    poses = []
+    for data in messages:
+        for transform in FrameTransforms.FromString(data).transforms:
+            at, turn = transform.translation, transform.rotation
+            poses.append((at.x, at.y, at.z, turn.w, turn.x, turn.y, turn.z))
+    return _floats(poses, (len(messages), bodies, 7))
+
+
+def _floats(rows: Sequence[Sequence[float]], shape: tuple[int, ...]) -> Floats:
+    return _array(rows, shape).astype(np.float32)
+
+
+def _array(rows: Sequence[Sequence[float]], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    return np.array(rows, dtype=np.float64).reshape(shape)

@@ -1,0 +1,108 @@
+"""Protobuf schemas of a recording: Foxglove's own where it has one, else those made here."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from google.protobuf import message_factory
+from google.protobuf.descriptor import FileDescriptor
+from google.protobuf.descriptor_pb2 import (
+    DescriptorProto,
+    FieldDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+)
+from google.protobuf.descriptor_pool import Default
+from google.protobuf.message import Message
+
+from proto.body import ACTION_NAMES
+
+__all__ = [
+    "CompressedImage",
+    "FrameTransforms",
+    "JointStates",
+    "Message",
+    "States",
+    "Step",
+    "describe",
+]
+
+
+def _field(number: int, name: str, kind: int, message: str | None = None) -> FieldDescriptorProto:
+    return FieldDescriptorProto(
+        number=number,
+        name=name,
+        type=kind,
+        type_name=message,
+        label=FieldDescriptorProto.LABEL_OPTIONAL,
+    )
+
+
+def _step_file() -> FileDescriptorProto:
+    """What the robot was told in one control step, and what the policy made of it."""
+    action = DescriptorProto(
+        name="Action",
+        field=[
+            _field(number, name, FieldDescriptorProto.TYPE_FLOAT)
+            for number, name in enumerate(ACTION_NAMES, 1)
+        ],
+    )
+    outputs = _field(5, "outputs", FieldDescriptorProto.TYPE_FLOAT)
+    outputs.label = FieldDescriptorProto.LABEL_REPEATED
+    step = DescriptorProto(
+        name="Step",
+        field=[
+            _field(1, "step", FieldDescriptorProto.TYPE_UINT32),
+            _field(2, "phase", FieldDescriptorProto.TYPE_UINT32),
+            _field(3, "action", FieldDescriptorProto.TYPE_MESSAGE, ".vmdnn.Action"),
+            _field(4, "target", FieldDescriptorProto.TYPE_MESSAGE, ".vmdnn.Action"),
+            outputs,
+        ],
+    )
+    return FileDescriptorProto(
+        name="vmdnn/step.proto", package="vmdnn", syntax="proto3", message_type=[action, step]
+    )
+
+
+def _states_file() -> FileDescriptorProto:
+    """What went on in a network in one control step."""
+    activity = _field(2, "activity", FieldDescriptorProto.TYPE_FLOAT)
+    activity.label = FieldDescriptorProto.LABEL_REPEATED
+    subnet = DescriptorProto(
+        name="Subnet", field=[_field(1, "name", FieldDescriptorProto.TYPE_STRING), activity]
+    )
+    subnets = _field(1, "subnets", FieldDescriptorProto.TYPE_MESSAGE, ".vmdnn.Subnet")
+    subnets.label = FieldDescriptorProto.LABEL_REPEATED
+    return FileDescriptorProto(
+        name="vmdnn/states.proto",
+        package="vmdnn",
+        syntax="proto3",
+        message_type=[subnet, DescriptorProto(name="States", field=[subnets])],
+    )
+
+
+Default().Add(_step_file())
+Default().Add(_states_file())
+Step: Final = message_factory.GetMessageClass(Default().FindMessageTypeByName("vmdnn.Step"))
+"""One control step: `step`, `phase`, `action` and `target` (units of `proto.body`), `outputs`."""
+States: Final = message_factory.GetMessageClass(Default().FindMessageTypeByName("vmdnn.States"))
+"""One control step of a network: `subnets`, each with its `name` and `activity`."""
+
+
+def describe(message: type[Message]) -> bytes:
+    """The schema of a message class as MCAP wants it: a set of files, what each needs before it."""
+    files: dict[str, FileDescriptorProto] = {}
+
+    def collect(file: FileDescriptor) -> None:
+        if file.name not in files:
+            for dependency in file.dependencies:
+                collect(dependency)
+            description = FileDescriptorProto()
+            file.CopyToProto(description)
+            files[file.name] = description
+
+    collect(message.DESCRIPTOR.file)
+    return bytes(FileDescriptorSet(file=files.values()).SerializeToString())

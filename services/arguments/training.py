@@ -1,0 +1,67 @@
+"""What the commands that train without the bus share: their arguments, and Ctrl-C."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+
+from learner.tutoring.store import TutoringStore
+from proto.errors import UserError
+
+
+def add_training_data(parser: argparse.ArgumentParser) -> None:
+    """Add --data and --pretraining-data."""
+    parser.add_argument("--data", type=Path, required=True, help="folder of tutored sequences")
+    parser.add_argument(
+        "--pretraining-data", type=Path, help="folder of sequences for pre-training, if others"
+    )
+
+
+def training_stores(arguments: argparse.Namespace) -> tuple[TutoringStore, TutoringStore | None]:
+    """The sequences that the arguments of `add_training_data` name.
+
+    Raises:
+        UserError: a folder is not there, or holds no sequence.
+    """
+    store = filled_store("--data", arguments.data)
+    if arguments.pretraining_data is None:
+        return store, None
+    return store, filled_store("--pretraining-data", arguments.pretraining_data)
+
+
+@contextmanager
+def interruption() -> Iterator[Callable[[], bool]]:
+    """Tell whether Ctrl-C was pressed, so that an epoch can end; a second one ends at once."""
+    pressed = False
+
+    def note(_signal: int, _frame: FrameType | None) -> None:
+        nonlocal pressed
+        pressed = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def filled_store(option: str, folder: Path) -> TutoringStore:
+    """The sequences in a folder that an option names.
+
+    Raises:
+        UserError: it is not there, or holds none.
+    """
+    if not folder.is_dir():
+        raise UserError(f"{option} {folder} is no folder; record one with `vmdnn tutor --out DIR`")
+    store = TutoringStore(folder)
+    if not store.ids:
+        raise UserError(
+            f"{option} {folder} holds no sequence (*.mcap); record some with"
+            " `vmdnn tutor --out DIR`"
+        )
+    return store

@@ -1,0 +1,1 @@
+"""Playing episodes without the bus: worker processes, tutoring, videos."""

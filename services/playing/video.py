@@ -1,0 +1,168 @@
+"""A recorded episode as a video: the scene from outside beside what the eye sees."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.attention import crop_of_focus
+from actors.simulator import EYE_HEIGHT, EYE_WIDTH, Crop, Pose, Simulator, make_simulator
+from actors.tasks.registry import make_task
+from proto.body import FOCUS
+from proto.config import SimulatorConfig, TaskConfig
+from proto.episode import Episode, Outcome, Reason
+from proto.errors import UserError
+from proto.storage import written_whole
+
+Picture = NDArray[np.uint8]
+
+PANEL_WIDTH: Final = 640
+PANEL_HEIGHT: Final = 480
+VIDEO_WIDTH: Final = 2 * PANEL_WIDTH
+VIDEO_HEIGHT: Final = PANEL_HEIGHT
+_LINE: Final = 24
+_MARGIN: Final = 12
+_WHITE: Final = (255, 255, 255)
+
+
+def write_video(
+    episode: Episode,
+    out: Path,
+    config: SimulatorConfig,
+    *,
+    fps: float | None = None,
+    on_frame: Callable[[], None] = lambda: None,
+) -> None:
+    """Render every step of a recorded episode into an MP4 file.
+
+    Nothing is simulated: the recorded joints and bodies are put on the stage, step by step.
+
+    Args:
+        episode: what was recorded.
+        out: the file; it appears under its name once it is whole.
+        config: the simulator that renders.
+        fps: frames, which are control steps, per second; None: as fast as it was.
+        on_frame: called after each frame.
+
+    Raises:
+        UserError: the simulator cannot render, or the file cannot be written.
+    """
+    rate = fps or 1.0 / episode.control_period_s
+    with (
+        closing(make_simulator(config.model_copy(update={"render": True}))) as simulator,
+        _video_file(out, rate) as write,
+    ):
+        for frame in frames(episode, simulator):
+            write(frame)
+            on_frame()
+
+
+def frames(episode: Episode, simulator: Simulator) -> Iterator[Picture]:
+    """Pictures (480, 1280, 3) uint8, red green blue, one for each step of the episode."""
+    task = make_task(TaskConfig.model_validate({"name": episode.task}))
+    scene = task.scene(episode.situation)
+    simulator.reset(scene)
+    boxes = {box.name for box in scene.boxes}
+    for step in range(episode.steps):
+        poses = _poses(episode, step)
+        joints_deg = episode.joints_deg[step].astype(np.float64)
+        simulator.show(joints_deg, {name: poses[name] for name in boxes & poses.keys()})
+        outside = simulator.outside_picture(PANEL_WIDTH, PANEL_HEIGHT).copy()
+        _write_lines(outside, _caption(episode, step))
+        focus = _focus_before(episode, step, float(task.start[FOCUS]))
+        eye = simulator.eye_picture(Crop(), PANEL_WIDTH, PANEL_HEIGHT).copy()
+        _frame_focus(eye, focus)
+        _show_seen(eye, episode.images[step])
+        yield np.hstack([outside, eye])
+
+
+def _poses(episode: Episode, step: int) -> Mapping[str, Pose]:
+    poses = {}
+    rows = episode.body_poses[step].tolist()
+    for name, (x, y, z, *quaternion) in zip(episode.body_names, rows, strict=True):
+        w, i, j, k = quaternion
+        poses[name] = Pose((x, y, z), (w, i, j, k))
+    return poses
+
+
+def _frame_focus(eye: Picture, focus: float) -> None:
+    """Frame what the focus level leaves of the whole eye image."""
+    crop = crop_of_focus(focus)
+    across, down = crop.width / EYE_WIDTH / 2, crop.height / EYE_HEIGHT / 2
+    corner = (round(PANEL_WIDTH * (0.5 - across)), round(PANEL_HEIGHT * (0.5 - down)))
+    opposite = (round(PANEL_WIDTH * (0.5 + across)) - 1, round(PANEL_HEIGHT * (0.5 + down)) - 1)
+    cv2.rectangle(eye, corner, opposite, _WHITE, 1)
+    _write_lines(eye, [f"left eye, focus {focus:.0f}"])
+
+
+def _show_seen(eye: Picture, image: Picture) -> None:
+    """Put the recorded picture, the one that the policy was given, into the lower right corner."""
+    seen = cv2.resize(image, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST)
+    rim = cv2.copyMakeBorder(seen, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=_WHITE)
+    eye[-rim.shape[0] :, -rim.shape[1] :] = rim[..., None]
+
+
+def _focus_before(episode: Episode, step: int, start: float) -> float:
+    """The focus level through which images[step] was seen: that of the action before."""
+    return start if step == 0 else float(episode.actions[step - 1, FOCUS])
+
+
+def _caption(episode: Episode, step: int) -> list[str]:
+    policy = episode.policy
+    if episode.policy_version:
+        policy += f" version {episode.policy_version}"
+    return [
+        f"{episode.task} in {episode.backend}, {episode.kind} by {policy}",
+        ", ".join(f"{name} {value:.4g}" for name, value in episode.situation.items()),
+        f"step {step + 1} of {episode.steps}, phase {episode.phases[step]}, "
+        f"outcome: {_in_words(episode.outcome)}",
+    ]
+
+
+def _in_words(outcome: Outcome) -> str:
+    reached = [name for name in ("lenient", "strict", "precise") if getattr(outcome, name)]
+    words = reached[-1] if reached else "failed"
+    if outcome.reason is not Reason.NONE:
+        words += f" ({outcome.reason.value.replace('_', ' ')})"
+    return words
+
+
+def _write_lines(picture: Picture, lines: Sequence[str]) -> None:
+    """White text on a darkened band along the top."""
+    band = picture[: len(lines) * _LINE + _MARGIN]
+    band //= 2
+    for number, line in enumerate(lines, 1):
+        place = (_MARGIN, number * _LINE)
+        cv2.putText(picture, line, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _WHITE, 1, cv2.LINE_AA)
+
+
+@contextmanager
+def _video_file(out: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
+    """Encode pictures elsewhere, and put the file where it belongs once it is whole."""
+    if out.suffix != ".mp4":
+        raise UserError(f"{out}: the video's name must end in .mp4")
+    with tempfile.TemporaryDirectory() as folder:
+        encoded = Path(folder) / "video.mp4"
+        size = (VIDEO_WIDTH, VIDEO_HEIGHT)
+        writer = cv2.VideoWriter(str(encoded), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
+        if not writer.isOpened():
+            raise UserError("OpenCV cannot encode MP4 here; install opencv-python-headless")
+
+        def write(picture: Picture) -> None:
+            if not writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
+                raise UserError(f"{out}: the video could not be written; is the disk full?")
+
+        try:
+            yield write
+        finally:
+            writer.release()
+        with encoded.open("rb") as source, written_whole(out) as target:
+            shutil.copyfileobj(source, target)

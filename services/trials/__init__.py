@@ -1,0 +1,1 @@
+"""Trials: played, counted, and compared between networks."""

@@ -1,0 +1,67 @@
+"""Testing a policy on situations that were never tutored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from actors.tasks.contract import Situation
+from actors.tasks.registry import make_task
+from proto.config import Config
+from proto.episode import Kind
+from proto.errors import UserError
+from services.playing.workers import Job
+from services.trials.success import Tally
+
+
+def trial_jobs(config: Config, trials: int, seed: int, folder: Path | None = None) -> list[Job]:
+    """Trials 0, 1, ... of a seed: the same situations for every policy and backend.
+
+    Args:
+        config: names the task.
+        trials: how many.
+        seed: trial i plays the situation that the task samples with seed + i.
+        folder: where rollouts are recorded, or None.
+    """
+    task = make_task(config.task)
+    return situation_jobs([task.sample(seed + trial) for trial in range(trials)], seed, folder)
+
+
+def situation_jobs(
+    situations: Sequence[Situation], seed: int, folder: Path | None = None
+) -> list[Job]:
+    """Trials of given situations; trial i has the seed seed + i."""
+    return [
+        Job(
+            situation=situation,
+            seed=seed + trial,
+            kind=Kind.TRIAL,
+            record_to=None if folder is None else folder / f"trial{trial:04d}.mcap",
+        )
+        for trial, situation in enumerate(situations)
+    ]
+
+
+def parse_situation(text: str) -> dict[str, float]:
+    """Read a situation such as `obstacle_x_m=-0.27,object_y_m=0.25,object_yaw_deg=44`.
+
+    Raises:
+        UserError: it is written otherwise.
+    """
+    try:
+        pairs = [part.split("=") for part in text.split(",")]
+        return {name.strip(): float(value) for name, value in pairs}
+    except ValueError:
+        raise UserError(f"--situation {text}: write NAME=VALUE,NAME=VALUE,...") from None
+
+
+def result_json(config: Config, policy: str, tally: Tally, wall_s: float) -> dict[str, Any]:
+    """What an evaluation found, for `json.dumps`."""
+    return {
+        "policy": policy,
+        "task": config.task.name,
+        "backend": config.simulator.backend,
+        **tally.as_json(),
+        "wall_s": wall_s,
+    }

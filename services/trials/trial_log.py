@@ -1,0 +1,128 @@
+"""Every trial that was counted, on disk: one line of JSON each."""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from proto.codec import MessageError, Number, Table, Wire, decode, encode, message, schema_of
+from proto.episode import Episode, Id, Outcome
+from proto.errors import UserError
+from proto.messages import Count, Rollout
+
+LOG = logging.getLogger(__name__)
+
+
+@message("counted_trial", 1, form="json")
+@dataclass(frozen=True)
+class CountedTrial:
+    """One line of the book.
+
+    Attributes:
+        run_id: training that the policy comes from.
+        policy_version: its version.
+        seed: seed of the situation; it tells one trial of a version from another.
+        episode: id of the episode.
+        actor: who played it.
+        situation: the situation's values by name.
+        outcome: how it ended.
+    """
+
+    run_id: Id
+    policy_version: Count
+    seed: int
+    episode: Id
+    actor: Id
+    situation: Annotated[Mapping[str, float], Table(Number(), most=32)]
+    outcome: Outcome
+
+    @classmethod
+    def of(cls, episode: Episode, run_id: str) -> CountedTrial:
+        """The line of an episode that was played with a policy of the training run_id."""
+        return cls(
+            run_id=run_id,
+            policy_version=episode.policy_version,
+            seed=episode.seed,
+            episode=episode.id,
+            actor=episode.actor,
+            situation=episode.situation,
+            outcome=episode.outcome,
+        )
+
+    def line(self) -> bytes:
+        """One line of JSON."""
+        return encode(self).payload + b"\n"
+
+
+def read_trials(path: Path) -> list[CountedTrial]:
+    """All lines of a book, or of what `vmdnn evaluate --outcomes` wrote.
+
+    Raises:
+        UserError: the file cannot be read, or a line of it is none of a book.
+    """
+    try:
+        lines = path.read_bytes().splitlines()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    try:
+        return [_trial(line) for line in lines]
+    except MessageError as error:
+        raise UserError(
+            f"{path} holds no outcomes of trials ({error}); `vmdnn evaluate --outcomes FILE` does"
+        ) from error
+
+
+def _trial(line: bytes) -> CountedTrial:
+    return decode(Wire(schema_of(CountedTrial).encoding, line), CountedTrial)
+
+
+class TrialLog:
+    """Counts each trial of each policy version once, whatever is restarted."""
+
+    def __init__(self, path: Path) -> None:
+        """Open a book, or begin it. A line that a killed process did not finish is dropped."""
+        self._path = path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._outcomes: dict[tuple[str, int], dict[int, Outcome]] = defaultdict(dict)
+        content = path.read_bytes() if path.exists() else b""
+        whole = content[: content.rfind(b"\n") + 1]
+        if whole != content:
+            LOG.warning("%s: dropped its last line, which was not finished", path)
+            with path.open("r+b") as file:
+                file.truncate(len(whole))
+        for number, line in enumerate(whole.splitlines(), 1):
+            self._read(line, number)
+
+    def add(self, rollout: Rollout) -> bool:
+        """Count a trial; False if it was counted before."""
+        trial = CountedTrial.of(rollout.episode, rollout.run_id)
+        if not self._count(trial):
+            return False
+        with self._path.open("ab") as file:
+            file.write(trial.line())
+        return True
+
+    def versions(self, run_id: str) -> list[int]:
+        """Policy versions of a training that were tried, oldest first."""
+        tried = list(self._outcomes)  # a copy: the other thread may add to it
+        return sorted(version for run, version in tried if run == run_id)
+
+    def outcomes(self, run_id: str, policy_version: int) -> Mapping[int, Outcome]:
+        """Outcomes of a policy version by the trial's seed."""
+        return dict(self._outcomes.get((run_id, policy_version), {}))
+
+    def _count(self, trial: CountedTrial) -> bool:
+        outcomes = self._outcomes[trial.run_id, trial.policy_version]
+        new = trial.seed not in outcomes
+        outcomes.setdefault(trial.seed, trial.outcome)
+        return new
+
+    def _read(self, line: bytes, number: int) -> None:
+        try:
+            self._count(_trial(line))
+        except MessageError as error:
+            LOG.warning("%s, line %d is not counted: %s", self._path, number, error)

@@ -1,0 +1,106 @@
+"""The tutor's plan: smooth in the situation, clear of the obstacle, within the robot's limits."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from actors.kinematics import Arm, Cuboid, Gaze
+from actors.tasks.experiment1.fitting import PostureFitter
+from actors.tasks.experiment1.plan import execution_noise, plan
+from actors.tasks.experiment1.postures import load_key_postures
+from actors.tasks.experiment1.task import (
+    OBSTACLE_SIZE_M,
+    START,
+    TABLE_DROP_M,
+    Experiment1,
+    object_pose,
+    obstacle_pose,
+)
+from proto.body import ACTION_VALUES, ARM, FOCUS, GRASP, NECK
+from sim_assets.hand import OPEN_DEG
+
+situations = st.fixed_dictionaries(
+    {name: st.floats(*limits) for name, limits in Experiment1().ranges().items()}
+)
+ARM_OPEN = Arm(OPEN_DEG, TABLE_DROP_M)
+
+
+@given(situations)
+@settings(max_examples=50)
+def test_plan_stays_within_the_limits_and_moves_smoothly(situation):
+    actions = plan(situation)
+    low = [value.minimum for value in ACTION_VALUES]
+    high = [value.maximum for value in ACTION_VALUES]
+    assert (actions >= low).all()
+    assert (actions <= high).all()
+    np.testing.assert_allclose(actions[0], START, atol=0.5)
+    assert np.abs(np.diff(actions[:, ARM], axis=0)).max() < 12.0
+
+
+@given(situations)
+@settings(max_examples=25)
+def test_open_arm_passes_the_obstacle_closely_but_clear(situation):
+    actions = plan(situation)
+    box = Cuboid(np.array(obstacle_pose(situation).position_m), np.array(OBSTACLE_SIZE_M))
+    approach = np.deg2rad(actions[actions[:, GRASP] <= 1.0][:, ARM])
+    clearance = min(
+        (box.distance(ARM_OPEN.pose(posture).points_m) - ARM_OPEN.radii_m).min()
+        for posture in approach
+    )
+    assert 0.008 < clearance < 0.020
+
+
+def test_neighbouring_cases_have_neighbouring_plans():
+    plans = {tuple(case.values()): plan(case) for case in Experiment1().tutored()}
+    axes = [sorted({key[axis] for key in plans}) for axis in range(3)]
+    steps = [
+        np.abs(plans[a] - plans[b])[:, ARM].max()
+        for a, b in itertools.combinations(plans, 2)
+        if sum(abs(axes[k].index(a[k]) - axes[k].index(b[k])) for k in range(3)) == 1
+    ]
+    assert len(steps) == 45 * 3 - 15 - 15 - 9
+    assert max(steps) < 35.0
+
+
+def test_attention_follows_the_subtasks():
+    task = Experiment1()
+    situation = task.sample(3)
+    actions = plan(situation)
+    looking_at_object = actions[task.phases == 5]
+    assert np.ptp(looking_at_object[:, NECK], axis=0).max() < 0.1
+    assert (actions[task.phases <= 5][:, FOCUS] == 1.0).all()
+    assert (actions[task.phases >= 7][:, FOCUS] == 20.0).all()
+    assert (actions[task.phases <= 6][:, GRASP] == 1.0).all()
+    assert (actions[task.phases == 8][:, GRASP] == 10.0).all()
+
+
+def test_gaze_centres_what_the_neck_can_reach():
+    gaze = Gaze(TABLE_DROP_M)
+    straight = gaze.neck_deg(np.array([0.0, 0.6, 0.0]))
+    right = gaze.neck_deg(np.array([0.3, 0.6, 0.0]))
+    below = gaze.neck_deg(
+        np.array(object_pose({"object_y_m": 0.3, "object_yaw_deg": 0}).position_m)
+    )
+    assert right[1] < straight[1] - 10.0
+    assert below[0] < straight[0] - 5.0
+
+
+def test_fitted_postures_are_those_that_lie_in_the_repository():
+    fitted, stored = PostureFitter().fit(), load_key_postures()
+    for postures in ("object", "obstacle"):
+        for name, rows in getattr(stored, postures).items():
+            np.testing.assert_allclose(getattr(fitted, postures)[name], rows, atol=0.05)
+
+
+def test_noise_is_smooth_seeded_and_of_the_size_asked_for():
+    noise = np.concatenate([execution_noise(124, seed, 1.0, 20.0) for seed in range(200)])
+    late = noise.reshape(200, 124, 11)[:, 40:]
+    assert late[..., ARM].std() == pytest.approx(1.0, abs=0.1)
+    assert np.abs(np.diff(late, axis=1)).max() < 0.6
+    assert (noise[..., [GRASP, FOCUS]] == 0.0).all()
+    np.testing.assert_array_equal(execution_noise(50, 7, 1, 20), execution_noise(50, 7, 1, 20))
+    assert np.abs(execution_noise(50, 7, 1, 20) - execution_noise(50, 8, 1, 20)).max() > 0.1
+    assert (execution_noise(50, 7, 0.0, 20.0) == 0.0).all()

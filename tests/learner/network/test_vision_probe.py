@@ -1,0 +1,120 @@
+"""What the vision tells is asked on sequences that nothing was fitted to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from learner.checkpoint import checkpoint_from_bytes, load_checkpoint
+from learner.network.vision_probe import PENALTIES, Vision, ask_classifier, probe, ridge_regression
+from learner.training.trainer import Trainer
+from learner.tutoring.store import TutoringStore
+from proto.config import Config
+from proto.episode import Episode
+from proto.errors import UserError
+
+MakeEpisodes = Callable[..., Sequence[Episode]]
+Array = NDArray[np.float64]
+LEARNED = {"places": (0.0, 0.5, 1.0), "slopes": (-1.0, -0.5, 0.0, 0.5, 1.0), "steps": 12}
+OTHERS = {"places": (0.25, 0.75), "slopes": (-0.25, 0.25), "steps": 12}
+
+
+@pytest.fixture(scope="module")
+def trainer(
+    tmp_path_factory: pytest.TempPathFactory,
+    small_config: Callable[..., Config],
+    bar_episodes: MakeEpisodes,
+) -> Trainer:
+    """A training whose pre-training is over."""
+    store = TutoringStore(tmp_path_factory.mktemp("tutoring"))
+    for episode in bar_episodes(**LEARNED):
+        store.add(episode)
+    trainer = Trainer(small_config(pretraining=40), store)
+    for _ in range(40):
+        trainer.epoch()
+    return trainer
+
+
+@pytest.fixture
+def vision(trainer: Trainer, tmp_path: Path) -> Vision:
+    path = tmp_path / "pretraining.safetensors"
+    trainer.save(path)
+    return Vision(load_checkpoint(path))
+
+
+def test_the_classifier_answers_as_it_has_learned(
+    vision: Vision, bar_episodes: MakeEpisodes
+) -> None:
+    learned = ask_classifier(vision, bar_episodes(**LEARNED))
+    assert [(answer.value, answer.classes) for answer in learned] == [
+        ("object_y_m", 3),
+        ("object_yaw_deg", 5),
+    ]
+    assert [answer.right for answer in learned] == [1.0, 1.0]
+    assert learned[0].error < 0.01
+    assert learned[1].error < 9
+    # of a picture that it cannot know it does not know the answer
+    nothing = [
+        bar_episodes(places=(place,), slopes=(slope,))[0] for place in (0, 1) for slope in (-1, 1)
+    ]
+    for episode in nothing:
+        episode.images[:] = 0
+    assert ask_classifier(vision, nothing)[0].error > 0.03
+
+
+def test_a_policy_has_no_classifier(trainer: Trainer, bar_episodes: MakeEpisodes) -> None:
+    trainer.epoch()
+    policy = Vision(checkpoint_from_bytes(trainer.policy_bytes(1), "policy"))
+    assert ask_classifier(policy, bar_episodes()) == []
+    assert probe(policy, bar_episodes(), bar_episodes())
+
+
+def test_the_vision_tells_what_lies_between_the_classes(
+    vision: Vision, bar_episodes: MakeEpisodes
+) -> None:
+    probes = probe(vision, bar_episodes(**LEARNED), bar_episodes(**OTHERS))
+    assert {told.value for told in probes} == {"object_y_m", "object_yaw_deg"}
+    assert [told.phase for told in probes] == sorted(told.phase for told in probes)
+    last = {told.value: told for told in probes if told.phase == 8}
+    assert last["object_y_m"].blind_error == pytest.approx(0.025)
+    assert last["object_y_m"].error < 0.4 * 0.025
+
+
+def test_nothing_can_be_asked_of_sequences_that_are_all_alike(
+    vision: Vision, bar_episodes: MakeEpisodes
+) -> None:
+    alike = bar_episodes(places=(0.5,), slopes=(0.5,))
+    with pytest.raises(UserError, match="no varying value"):
+        probe(vision, alike, bar_episodes())
+
+
+def refitted(features: Array, values: Array, penalty: float, others: Array) -> Array:
+    centred = features - features.mean(0)
+    gram = centred.T @ centred + penalty * np.eye(features.shape[1])
+    weights = np.linalg.solve(gram, centred.T @ (values - values.mean()))
+    return values.mean() + (others - features.mean(0)) @ weights
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.3, 3.0])
+def test_the_penalty_is_the_one_that_tells_left_out_values_best(noise: float) -> None:
+    random = np.random.default_rng(1)
+    values = np.repeat([-45.0, -22.5, 0.0, 22.5, 45.0], 4)
+    pattern = random.normal(size=7) / 45
+    features = values[:, None] * pattern + noise * random.normal(size=(20, 7))
+    others = random.normal(size=(6, 7))
+
+    def error(penalty: float) -> float:
+        kept = [(values != value, values == value) for value in np.unique(values)]
+        return sum(
+            np.square(refitted(features[k], values[k], penalty, features[o]) - values[o]).sum()
+            for k, o in kept
+        )
+
+    scale = np.square(features - features.mean(0)).sum() / len(values)
+    best = min(PENALTIES * scale, key=error)
+    told = ridge_regression(features, values, others)
+    np.testing.assert_allclose(told, refitted(features, values, best, others), rtol=1e-5)

@@ -1,0 +1,365 @@
+"""The learner as a process: asks, keeps, trains, publishes, and carries on after a kill."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from subprocess import Popen
+
+import numpy as np
+import pytest
+from ports import free_endpoint
+from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
+
+from actors.tasks.registry import make_task
+from learner.checkpoint import (
+    checkpoint_from_bytes,
+    load_checkpoint,
+    pretraining_file,
+    training_file,
+)
+from learner.network_policy import NetworkPolicy
+from proto.bus import Bus, open_bus
+from proto.config import HubConfig, TaskConfig
+from proto.episode import Episode, Kind, Outcome, Reason
+from proto.keys import Role
+from proto.messages import (
+    Command,
+    Control,
+    ControlReply,
+    Correction,
+    PolicyVersion,
+    Receipt,
+    Sequence,
+    TutoringCase,
+    TutoringRequest,
+    Verdict,
+)
+from proto.metrics import LearnerMetrics, Stage
+from proto.recordings.episodes import read_episode
+
+MakeEpisode = Callable[..., Episode]
+SETTINGS = {
+    "run.name": "test",
+    "tutor.repeats": 1,
+    "learner.cases": [0, 20, 44],
+    "learner.start_sequences": 45,
+    "learner.pretraining.task": "null",
+    "learner.pretraining.epochs": 2,
+    "learner.epochs": 400,
+    "learner.publish_every_epochs": 5,
+    "learner.checkpoint_every_epochs": 7,
+    "done.policy_versions": 3,
+}
+
+
+FAILED = Outcome(False, False, False, Reason.NOT_LIFTED, 0.0, 1, 2, 3, 4, 5, 80, -1)
+
+
+def case(number: int, repeat: int, task: str = "experiment1") -> TutoringCase:
+    return TutoringCase(task, number, repeat)
+
+
+class School:
+    """A hub, a learner, and a session that acts as an actor."""
+
+    def __init__(self, stack: ExitStack, folder: Path, make_episode: MakeEpisode) -> None:
+        self._stack = stack
+        self._make_episode = make_episode
+        self.folder = folder / "test"
+        self.endpoint = free_endpoint()
+        self.words = ["--connect", self.endpoint, "--set", f"run.folder={folder}"]
+        for key, value in SETTINGS.items():
+            self.words += ["--set", f"{key}={value}"]
+        stack.enter_context(listening_hub(self.endpoint))
+        self.actor = self.join("actor")
+        self.actor.announce()
+        self.policies: list[PolicyVersion] = []
+        self.told: LearnerMetrics | None = None
+        self._receipts: list[Receipt] = []
+        keys = self.actor.keys
+        self.actor.subscribe_newest(keys.policy, self.policies.append, PolicyVersion)
+        self.actor.subscribe(keys.metrics(Role.LEARNER), self._listen, LearnerMetrics)
+        self.actor.subscribe(keys.receipt("actor"), self._receipts.append, Receipt)
+        self.process: Popen[bytes]
+
+    def start(self, *more: str) -> None:
+        self.told = None
+        self.process = self._stack.enter_context(vmdnn("learner", *self.words, *more))
+
+    def join(self, name: str) -> Bus:
+        bus = open_bus(HubConfig(endpoint=self.endpoint), "test", Role.ACTOR, name)
+        return self._stack.enter_context(bus)
+
+    def ask(self) -> list[TutoringCase | Correction]:
+        """Ask as an actor that holds the newest policy it heard of."""
+        newest = [(policy.run_id, policy.version) for policy in self.policies[-1:]]
+        request = TutoringRequest("actor", *(newest[0] if newest else ("", 0)))
+        key = self.actor.keys.request_tutoring
+        answers: list[TutoringCase | Correction]
+        answers = self.actor.ask(key, request, TutoringCase, Correction)
+        return answers
+
+    def ask_until_given(self) -> TutoringCase | Correction:
+        given: list[TutoringCase | Correction] = []
+
+        def asked() -> bool:
+            given.extend(self.ask())
+            return bool(given)
+
+        eventually(asked, "something to show")
+        return given[0]
+
+    def correction(self, asked: Correction, **fields: object) -> Episode:
+        given = {
+            "id": f"corrected{asked.seed}",
+            "task": asked.task,
+            "seed": asked.seed,
+            "situation": dict(asked.situation),
+            "policy_version": self.policies[-1].version,
+            **fields,
+        }
+        return self._make_episode(20, kind=Kind.CORRECTION, actor="actor", **given)
+
+    def practise_in_vain(self, seed: int) -> Correction:
+        """The policy fails in practice, so it is guided there."""
+        task, newest = make_task(TaskConfig()), self.policies[-1]
+        policy = {"run_id": newest.run_id, "policy_version": newest.version, "task": task.name}
+        verdict = Verdict(seed=seed, situation=task.sample(seed), outcome=FAILED, **policy)
+        asked: list[TutoringCase | Correction] = []
+
+        def heard() -> bool:
+            self.actor.deliver(self.actor.keys.verdict, verdict)
+            asked.extend(self.ask())
+            return bool(asked)
+
+        eventually(heard, "a correction is asked for")
+        assert isinstance(asked[0], Correction)
+        return asked[0]
+
+    def episode(self, shown: TutoringCase, **fields: object) -> Episode:
+        task = make_task(TaskConfig.model_validate({"name": shown.task}))
+        given = {
+            "id": f"case{shown.case}",
+            "task": shown.task,
+            "seed": shown.seed,
+            "situation": dict(task.tutored()[shown.case]),
+            **fields,
+        }
+        return self._make_episode(20, kind=Kind.TUTORING, actor="actor", **given)
+
+    def send(self, episode: Episode) -> None:
+        """Send a sequence until its receipt comes."""
+        self._receipts.clear()
+
+        def received() -> bool:
+            self.actor.deliver(self.actor.keys.sequence("actor"), Sequence(episode))
+            return Receipt(episode.id) in self._receipts
+
+        eventually(received, "a receipt")
+
+    def show_all(self) -> None:
+        for number in SETTINGS["learner.cases"]:  # type: ignore[attr-defined]
+            self.send(self.episode(case(number, 0)))
+
+    def tells(self, what: Callable[[LearnerMetrics], bool]) -> LearnerMetrics:
+        eventually(lambda: self.told is not None and what(self.told), "the metrics it should tell")
+        assert self.told is not None
+        return self.told
+
+    def _listen(self, metrics: LearnerMetrics) -> None:
+        self.told = metrics
+
+
+@pytest.fixture
+def school(tmp_path: Path, make_episode: MakeEpisode) -> Iterator[School]:
+    with ExitStack() as stack:
+        yield School(stack, tmp_path, make_episode)
+
+
+def test_it_asks_for_each_case_once_and_keeps_what_it_is_shown(school: School) -> None:
+    school.start()
+    given = [school.ask_until_given(), *school.ask(), *school.ask(), *school.ask()]
+    assert given == [case(number, 0) for number in (0, 20, 44)]
+    told = school.tells(lambda told: told.stage is Stage.WAITING)
+    assert (told.sequences, told.loss, told.policy_version) == (0, None, 0)
+
+    school.send(school.episode(given[0]))
+    school.send(school.episode(given[0]))
+    school.send(school.episode(given[0], id="the-same-case-shown-by-another"))
+    school.send(school.episode(case(7, 0), id="a-case-nobody-asked-for"))
+    school.send(school.episode(given[1], task="experiment9", id="another-task"))
+    school.tells(lambda told: told.sequences == 1)
+    kept = list((school.folder / "tutoring").iterdir())
+    assert [path.name for path in kept] == ["case0.mcap"]
+    sent = school.episode(given[0])
+    assert np.array_equal(read_episode(kept[0]).images, sent.images)
+
+    # what was shown is not asked for again, what the actor took with it is
+    school.process.kill()
+    school.process.wait()
+    school.start()
+    assert school.ask_until_given() == case(20, 0)
+    assert stop(school.process) == 0
+
+
+def test_pretraining_has_cases_of_its_own_and_does_not_wait_for_the_others(
+    school: School,
+) -> None:
+    asked = {"task": "reaching", "cases": "[0,14]", "repeats": 1, "epochs": 3}
+    words = [f"--set=learner.pretraining.{name}={value}" for name, value in asked.items()]
+    school.start(*words, "--set", "learner.publish_every_epochs=400")
+    first, second = case(0, 0, "reaching"), case(14, 0, "reaching")
+    assert [school.ask_until_given(), *school.ask(), *school.ask()] == [first, second, case(0, 0)]
+    school.send(school.episode(case(0, 0)))
+    school.send(school.episode(first, id="reaching0"))
+    assert school.tells(lambda told: told.sequences == 2).stage is Stage.WAITING
+
+    school.send(school.episode(second, id="reaching14"))
+    formed = pretraining_file(school.folder)
+    eventually(formed.exists, "pre-training is over")
+    told = school.tells(lambda told: told.stage is Stage.WAITING and told.epoch == 3)
+    assert (told.epochs_total, told.sequences) == (3, 3)
+    checkpoint = load_checkpoint(formed)
+    assert checkpoint.metadata.stage is Stage.PRETRAINING
+    training = checkpoint.metadata.training
+    assert training is not None
+    assert training.sequences == ("reaching0", "reaching14")
+    assert set(training.classes) == {"object_y_m", "object_yaw_deg"}
+    assert checkpoint.part("classifier.")["weight"].shape == (3 + 5, 20)
+
+    # it goes on with the others once they are there, also after a restart
+    school.process.kill()
+    school.process.wait()
+    school.start(*words, "--set", "learner.publish_every_epochs=400")
+    school.show_all()
+    school.tells(lambda told: told.stage is Stage.FINISHED)
+    assert stop(school.process) == 0
+    kept = {path.stem for path in (school.folder / "pretraining").iterdir()}
+    assert kept == {"reaching0", "reaching14"}
+    tutored = {path.stem for path in (school.folder / "tutoring").iterdir()}
+    assert tutored == {"case0", "case20", "case44"}
+
+
+def test_a_killed_learner_publishes_its_policy_again_and_goes_on(school: School) -> None:
+    school.start()
+    school.show_all()
+    eventually(lambda: len(school.policies) >= 3, "three policies")
+    school.process.kill()
+    school.process.wait()
+    before = list(school.policies)
+    assert [policy.version for policy in before] == list(range(1, len(before) + 1))
+    assert [policy.epoch for policy in before] == [5 * policy.version for policy in before]
+    policy = NetworkPolicy.from_bytes(before[-1].weights)
+    assert policy.version == before[-1].version
+    assert policy.step(np.zeros((48, 64), np.uint8)).shape == (11,)
+
+    # it may have saved one more than anyone heard of before it was killed
+    known = load_checkpoint(training_file(school.folder)).metadata.version
+    assert known in {before[-1].version, before[-1].version + 1}
+
+    school.policies.clear()
+    school.start()
+    eventually(lambda: len(school.policies) >= 3, "policies after the restart")
+    again = school.policies[0]
+    assert again.version == known
+    if known == before[-1].version:
+        assert again == before[-1]
+    assert {policy.run_id for policy in school.policies} == {before[0].run_id}
+    versions = [policy.version for policy in school.policies]
+    assert versions == list(range(again.version, again.version + len(versions)))
+    assert [policy.epoch for policy in school.policies] == [5 * version for version in versions]
+    assert school.ask() == [], "everything was shown before"
+    school.tells(lambda told: told.done and told.sequences == 3)
+
+
+def test_its_policy_is_corrected_where_it_fails_and_it_learns_on(school: School) -> None:
+    corrections = {"rounds": 1, "sequences": 3, "tries": 5, "epochs": 4}
+    words = [f"--set=learner.corrections.{name}={value}" for name, value in corrections.items()]
+    words += ["--set", "learner.epochs=6", "--set", "done.policy_versions=3"]
+    school.start(*words)
+    school.show_all()
+    told = school.tells(lambda told: told.stage is Stage.WAITING and told.round == 1)
+    assert (told.epoch, told.epochs_total, told.policy_version) == (6, 10, 2)
+    assert (told.corrections, told.corrections_total, told.done) == (0, 3, False)
+    eventually(
+        lambda: [p.epoch for p in school.policies] == [5, 6], "the policies of the first lap"
+    )
+    assert school.ask() == [], "it knows of no failure"
+
+    first, second = school.practise_in_vain(2**30), school.practise_in_vain(2**30 + 1)
+    task = make_task(TaskConfig())
+    assert first == Correction("experiment1", 2**30, task.sample(2**30))
+    school.send(school.correction(first))
+    school.send(school.correction(first, id="the-same-once-more"))
+    school.send(school.correction(first, id="of-another-policy", policy_version=1))
+    school.tells(lambda told: told.corrections == 1)
+
+    # what was asked for and shown before is not forgotten
+    school.process.kill()
+    school.process.wait()
+    school.policies.clear()
+    school.start(*words)
+    told = school.tells(lambda told: told.stage is Stage.WAITING)
+    assert (told.corrections, told.sequences) == (1, 4)
+    eventually(lambda: [p.version for p in school.policies] == [2], "the newest policy again")
+    school.send(school.correction(second))
+    school.send(school.correction(school.practise_in_vain(2**30 + 2)))
+
+    told = school.tells(lambda told: told.stage is Stage.FINISHED)
+    assert (told.epoch, told.sequences, told.policy_version, told.done) == (10, 6, 3, True)
+    eventually(lambda: school.policies[-1].version == 3, "a policy of the round")
+    metadata = checkpoint_from_bytes(school.policies[-1].weights, "").metadata
+    assert (metadata.epoch, metadata.cases, metadata.sequences) == (10, 6, 6)
+    assert school.ask() == []
+    assert stop(school.process) == 0
+
+
+def test_it_obeys_and_a_clean_stop_loses_no_epoch(school: School) -> None:
+    school.start("--set", "learner.epochs=1000000", "--set", "learner.publish_every_epochs=1000")
+    school.show_all()
+    school.tells(lambda told: told.stage is Stage.COUPLED and told.epoch > 0)
+
+    def tell(command: Command) -> str:
+        control = school.actor.keys.control(Role.LEARNER)
+        replies = school.actor.ask(control, Control(command), ControlReply, timeout_s=20.0)
+        return " ".join(reply.note for reply in replies)
+
+    assert tell(Command.PAUSE) == "paused"
+    paused = school.tells(lambda told: told.paused and told.epochs_per_s == 0)
+    assert school.tells(lambda told: told.time_s > paused.time_s).epoch == paused.epoch
+    checkpoint = school.folder / "checkpoints" / "training.safetensors"
+    assert tell(Command.CHECKPOINT) == f"saved coupled epoch {paused.epoch} to {checkpoint}"
+    tell(Command.RESUME)
+    school.tells(lambda told: told.epoch > paused.epoch)
+    assert stop(school.process) == 0
+    last = school.told
+    assert last is not None
+    assert load_checkpoint(checkpoint).metadata.epoch >= last.epoch
+
+
+def test_the_last_epoch_gives_a_policy_that_another_network_does_not_overwrite(
+    school: School,
+) -> None:
+    school.start("--set", "learner.epochs=8")
+    school.show_all()
+    told = school.tells(lambda told: told.stage is Stage.FINISHED)
+    eventually(lambda: [p.epoch for p in school.policies] == [5, 8], "two policies")
+    assert (told.epoch, told.epochs_total, told.policy_version) == (8, 8, 2)
+    assert not told.done, "the configuration asks for three versions"
+    assert stop(school.process) == 0
+
+    checkpoint = school.folder / "checkpoints" / "training.safetensors"
+    before = checkpoint.read_bytes()
+    ended = run_vmdnn("learner", *school.words, "--set", "network.pfc.units=7")
+    assert ended.returncode == 2
+    assert "network.pfc" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert checkpoint.read_bytes() == before
+
+
+def test_a_wrong_case_is_said_before_anything_starts(school: School) -> None:
+    ended = run_vmdnn("learner", *school.words, "--set", "learner.cases=[45]")
+    assert ended.returncode == 2
+    assert "learner.cases: there is no case 45" in ended.stderr

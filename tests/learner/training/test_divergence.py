@@ -1,0 +1,277 @@
+"""All ways to compute the loss and its gradients agree with the plain one, in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from learner.bench.reference import plain_divergence
+from learner.kernels import cpu
+from learner.kernels.build import NotCompiledError, find_or_compile
+from learner.kernels.library import learning_library
+from learner.network.vmdnn import VMDNN
+from learner.training.divergence import add_gradients, divergence, reference_divergence
+from learner.training.sequences import Sequences
+from proto.config import NetworkConfig
+
+Loss = Callable[[VMDNN, Sequences, Tensor, Tensor | None, Tensor | None], Tensor]
+DOUBLE = torch.float64
+
+
+@pytest.fixture(scope="module")
+def _compiled() -> None:
+    try:
+        find_or_compile()
+    except NotCompiledError as error:
+        pytest.skip(f"the C++ kernel is not compiled here: {error}")
+
+
+sizes = st.integers(1, 23)
+taus = st.floats(1, 200)
+
+
+@st.composite
+def configs(draw: st.DrawFn) -> NetworkConfig:
+    """Networks with any levels; the vision has maps x 2 x 3 units."""
+
+    def level() -> dict[str, object]:
+        return {"units": draw(sizes), "tau": draw(taus)}
+
+    return NetworkConfig.model_validate(
+        {
+            "image": (8, 6),
+            "mstnn_fast": {"maps": 1, "kernel": (4, 3), "stride": 1, "tau": 2},
+            "mstnn_slow": {"maps": draw(sizes), "kernel": (3, 3), "stride": 1, "tau": 2},
+            "pfc": level(),
+            "mtrnn_slow": level(),
+            "mtrnn_fast": level(),
+            "softmax_units": draw(st.integers(2, 12)),
+            "update_order": draw(st.sampled_from(["bottom_up", "literal"])),
+        }
+    )
+
+
+def network_of(config: NetworkConfig, seed: int = 1, limit: float = 0.5) -> VMDNN:
+    network = VMDNN(config).to(DOUBLE)
+    network.initialize(
+        torch.Generator().manual_seed(seed), initial_range=limit, pfc_input_range=limit
+    )
+    return network
+
+
+def sequences_for(network: VMDNN, lengths: list[int], seed: int = 2) -> Sequences:
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(*shape: int) -> Tensor:
+        return torch.randn(shape, generator=generator, dtype=DOUBLE)
+
+    inputs = network.pfc.input.shape[1]
+    return Sequences.stacked(
+        [draw(length, inputs) for length in lengths],
+        [torch.softmax(2 * draw(length, *network.outputs.shape), -1) for length in lengths],
+    )
+
+
+def as_type(sequences: Sequences, dtype: torch.dtype) -> Sequences:
+    return Sequences(*(tensor.to(dtype) for tensor in vars(sequences).values()))
+
+
+def loss_and_gradients(
+    loss: Loss, network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor
+) -> list[Tensor]:
+    """The loss, and its gradients by the parameters, what was seen, its shift, and the state."""
+    seen = sequences.seen.clone().requires_grad_()
+    initial = initial.clone().requires_grad_()
+    generator = torch.Generator().manual_seed(3)
+    shift = torch.randn(len(chosen), seen.shape[2], generator=generator, dtype=DOUBLE)
+    shift = shift.to(seen.dtype).requires_grad_()
+    value = loss(network, Sequences(**{**vars(sequences), "seen": seen}), chosen, initial, shift)
+    by = [*network.core_parameters(), seen, initial, shift]
+    gradients = torch.autograd.grad(3 * value, by, allow_unused=True, materialize_grads=True)
+    return [value.detach(), *gradients]
+
+
+def assert_alike(results: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
+    """To within a part of the largest entry of each tensor."""
+    for result, right in zip(results, expected, strict=True):
+        assert result.shape == right.shape
+        scale = right.abs().max().item()
+        difference = (result.to(DOUBLE) - right).abs().max().item()
+        assert difference <= tolerance * (scale + 1e-9)
+
+
+@pytest.mark.usefixtures("_compiled")
+@settings(max_examples=40)
+@given(
+    config=configs(),
+    lengths=st.lists(st.integers(1, 40), min_size=1, max_size=20),
+    data=st.data(),
+)
+def test_kernel_agrees_with_plain_autograd(
+    config: NetworkConfig, lengths: list[int], data: st.DataObject
+) -> None:
+    network = network_of(config)
+    sequences = sequences_for(network, lengths)
+    order = data.draw(st.permutations(range(len(lengths))))
+    chosen = torch.tensor(order[: data.draw(st.integers(1, len(order)))])
+    units = sum(level.units for level in network.levels())
+    initial = torch.randn(len(chosen), units, dtype=DOUBLE)
+    expected = loss_and_gradients(plain_divergence, network, sequences, chosen, initial)
+
+    assert_alike(
+        loss_and_gradients(cpu.divergence, network, sequences, chosen, initial), expected, 1e-10
+    )
+    assert_alike(
+        loss_and_gradients(reference_divergence, network, sequences, chosen, initial),
+        expected,
+        1e-10,
+    )
+    single = VMDNN(config)
+    single.load_state_dict(network.state_dict())
+    results = loss_and_gradients(
+        cpu.divergence, single, as_type(sequences, torch.float32), chosen, initial.float()
+    )
+    assert_alike(results, expected, 1e-4)
+
+
+@pytest.mark.usefixtures("_compiled")
+@pytest.mark.parametrize("order", ["bottom_up", "literal"])
+def test_paper_network_in_single_precision(order: str) -> None:
+    """At the paper's sizes float32 itself is good for 1e-5."""
+    config = NetworkConfig.model_validate({"update_order": order})
+    network = network_of(config, limit=0.1)
+    sequences = sequences_for(network, [70, 130, 101, 130, 125])
+    chosen, initial = torch.arange(5), torch.zeros(5, 100, dtype=DOUBLE)
+    expected = loss_and_gradients(plain_divergence, network, sequences, chosen, initial)
+    single = VMDNN(config)
+    single.load_state_dict(network.state_dict())
+    results = loss_and_gradients(
+        cpu.divergence, single, as_type(sequences, torch.float32), chosen, initial.float()
+    )
+    assert_alike(results, expected, 1e-5)
+
+
+@pytest.mark.usefixtures("_compiled")
+@pytest.mark.parametrize("order", ["bottom_up", "literal"])
+@pytest.mark.parametrize("shifted", [True, False])
+def test_gradients_are_added_as_backward_adds_them(order: str, shifted: bool) -> None:
+    network = network_of(NetworkConfig.model_validate({"update_order": order}))
+    sequences, chosen = sequences_for(network, [1, 40, 33, 7] * 5), torch.randperm(20)[:18]
+    shift = torch.randn(18, sequences.seen.shape[2], dtype=DOUBLE) if shifted else None
+    parameters = network.core_parameters()
+    for _ in range(2):
+        loss = plain_divergence(network, sequences, chosen, None, shift)
+        loss.backward()
+    expected = [parameter.grad for parameter in parameters]
+    network.zero_grad()
+    for _ in range(2):
+        assert add_gradients(network, sequences, chosen, shift) == pytest.approx(loss.item())
+    assert_alike([p.grad for p in parameters], expected, 1e-10)
+
+
+@pytest.mark.usefixtures("_compiled")
+def test_small_activity_keeps_its_digits() -> None:
+    """The paper's initial range leaves activities of 1e-4, which count as much as large ones."""
+    network = network_of(NetworkConfig(), limit=1e-3)
+    sequences = sequences_for(network, [50] * 3)
+    chosen, initial = torch.arange(3), torch.zeros(3, 100, dtype=DOUBLE)
+    expected = loss_and_gradients(plain_divergence, network, sequences, chosen, initial)
+    single = VMDNN(NetworkConfig())
+    single.load_state_dict(network.state_dict())
+    results = loss_and_gradients(
+        cpu.divergence, single, as_type(sequences, torch.float32), chosen, initial.float()
+    )
+    assert_alike(results, expected, 1e-5)
+
+
+@pytest.mark.usefixtures("_compiled")
+def test_same_numbers_for_any_number_of_threads() -> None:
+    network = VMDNN(NetworkConfig())
+    network.load_state_dict(network_of(NetworkConfig()).state_dict())
+    sequences = as_type(sequences_for(network, [60] * 50), torch.float32)
+    chosen, initial = torch.arange(50), torch.zeros(50, 100)
+    before = torch.get_num_threads()
+    try:
+        results = []
+        for threads in (1, 2, 5):
+            torch.set_num_threads(threads)
+            results.append(loss_and_gradients(cpu.divergence, network, sequences, chosen, initial))
+    finally:
+        torch.set_num_threads(before)
+    for result in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
+
+
+@pytest.mark.usefixtures("_compiled")
+def test_what_fills_up_a_sequence_does_not_count() -> None:
+    network = network_of(NetworkConfig())
+    sequences = sequences_for(network, [9, 30])
+    chosen, initial = torch.arange(2), torch.zeros(2, 100, dtype=DOUBLE)
+    expected = loss_and_gradients(cpu.divergence, network, sequences, chosen, initial)
+    sequences.seen[0, 9:] = 7
+    sequences.codes[0, 9:] = 0.1
+    results = loss_and_gradients(cpu.divergence, network, sequences, chosen, initial)
+    assert all(torch.equal(a, b) for a, b in zip(results, expected, strict=True))
+
+
+@pytest.mark.usefixtures("_compiled")
+def test_second_derivatives_are_refused() -> None:
+    network = network_of(NetworkConfig())
+    loss = divergence(network, sequences_for(network, [4]), torch.tensor([0]))
+    with pytest.raises(RuntimeError, match="first derivatives only"):
+        torch.autograd.grad(loss, network.core_parameters(), create_graph=True)
+
+
+@pytest.mark.usefixtures("_compiled")
+def test_without_gradients_the_same_loss() -> None:
+    network = network_of(NetworkConfig())
+    sequences, chosen = sequences_for(network, [20, 7]), torch.tensor([1, 0])
+    with torch.no_grad():
+        value = divergence(network, sequences, chosen)
+    assert not value.requires_grad
+    assert value == divergence(network, sequences, chosen)
+
+
+@pytest.mark.usefixtures("_compiled")
+@pytest.mark.parametrize("chosen", [[-1], [2], []])
+def test_indices_outside_are_refused(chosen: list[int]) -> None:
+    network = network_of(NetworkConfig())
+    with pytest.raises((IndexError, ValueError), match="chosen"):
+        cpu.divergence(
+            network, sequences_for(network, [3, 4]), torch.tensor(chosen, dtype=torch.int64)
+        )
+
+
+@pytest.mark.usefixtures("_compiled")
+def test_sequences_of_another_network_are_refused() -> None:
+    network = network_of(NetworkConfig())
+    other = network_of(NetworkConfig(softmax_units=7))
+    with pytest.raises(ValueError, match="codes"):
+        cpu.divergence(network, sequences_for(other, [3]), torch.tensor([0]))
+
+
+def test_without_a_compiler_pytorch_computes_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: object, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
+    monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
+    cpu._functions.cache_clear()
+    learning_library.cache_clear()
+    try:
+        network = network_of(NetworkConfig())
+        sequences, chosen = sequences_for(network, [5]), torch.tensor([0])
+        assert not cpu.serves(sequences)
+        expected = reference_divergence(network, sequences, chosen)
+        assert torch.equal(divergence(network, sequences, chosen), expected)
+        assert add_gradients(network, sequences, chosen) == expected
+    finally:
+        cpu._functions.cache_clear()
+        learning_library.cache_clear()
+    assert len([line for line in caplog.messages if "no C++ compiler" in line]) == 1

@@ -1,0 +1,174 @@
+"""A round of corrections: in which situations, for whom, and when it is over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from actors.tasks.experiment1.task import Experiment1
+from learner.tutoring.corrections import Round
+from proto.config import Config
+from proto.episode import Episode, Kind, Outcome, Reason
+from proto.messages import Correction, TutoringRequest, Verdict
+from proto.seeds import CORRECTIONS
+
+MakeEpisode = Callable[..., Episode]
+TASK = Experiment1()
+POLICY = ("training", 7)
+PRECISE = Outcome(True, True, True, Reason.NONE, 0.1, 1, 2, 3, 4, 5, 80, -1)
+IMPRECISE = Outcome(True, True, False, Reason.IMPRECISE, 0.1, 1, 2, 11, 4, 5, 80, -1)
+
+
+def make_round(number: int = 1, cases: tuple[int, ...] | None = None, **given: Any) -> Round:
+    corrections = {"rounds": 3, "choose": "failures", "sequences": 2, "tries": 5, **given}
+    config = Config.model_validate({"learner": {"cases": cases, "corrections": corrections}})
+    return Round(config, number, POLICY, TASK)
+
+
+def ask(round_: Round, actor: str = "actor", policy: tuple[str, int] = POLICY) -> Correction | None:
+    return round_.next_correction(TutoringRequest(actor, *policy))
+
+
+def ask_all(round_: Round) -> list[Correction]:
+    asked = []
+    while (correction := ask(round_)) is not None:
+        asked.append(correction)
+    return asked
+
+
+def verdict(seed: int, outcome: Outcome = IMPRECISE, **given: Any) -> Verdict:
+    values = {"run_id": "training", "policy_version": 7, "task": "experiment1", **given}
+    return Verdict(seed=seed, situation=TASK.sample(seed), outcome=outcome, **values)
+
+
+@pytest.fixture
+def correction(make_episode: MakeEpisode) -> Callable[..., Episode]:
+    def make(seed: int, **given: Any) -> Episode:
+        values = {"kind": Kind.CORRECTION, "policy_version": 7, "task": "experiment1", **given}
+        return make_episode(5, seed=seed, **values)
+
+    return make
+
+
+def test_what_failed_in_practice_is_corrected(correction: Callable[..., Episode]) -> None:
+    round_ = make_round()
+    assert ask(round_) is None
+    round_.judge(verdict(1, PRECISE))
+    round_.judge(verdict(2))
+    round_.judge(verdict(2))  # a rollout that was sent twice
+    assert ask_all(round_) == [Correction("experiment1", 2, TASK.sample(2))]
+    assert (round_.judged, round_.kept, round_.most) == (2, 0, 2)
+
+    round_.shown(correction(2))
+    round_.judge(verdict(2))
+    assert ask(round_) is None
+    assert not round_.complete, "there may be more failures"
+    round_.judge(verdict(3))
+    round_.judge(verdict(4))
+    assert [asked.seed for asked in ask_all(round_)] == [3], "two are enough"
+    assert not round_.complete
+    round_.shown(correction(3))
+    assert round_.complete
+    assert round_.kept == 2
+
+
+def test_a_good_policy_is_not_searched_for_failures_for_ever(
+    correction: Callable[..., Episode],
+) -> None:
+    round_ = make_round()
+    round_.judge(verdict(0))
+    for seed in range(1, 5):
+        assert not round_.complete
+        round_.judge(verdict(seed, PRECISE))
+    assert not round_.complete, "the one failure is still to be corrected"
+    round_.judge(verdict(9))
+    assert [asked.seed for asked in ask_all(round_)] == [0]
+    round_.shown(correction(0))
+    assert round_.complete
+
+
+@pytest.mark.parametrize(
+    "foreign", [{"policy_version": 6}, {"run_id": "before"}, {"task": "reaching"}]
+)
+def test_only_the_newest_policys_practice_counts(foreign: dict[str, Any]) -> None:
+    round_ = make_round()
+    round_.judge(verdict(2, **foreign))
+    assert ask(round_) is None
+    assert round_.judged == 0
+
+
+def test_only_who_holds_the_newest_policy_is_asked() -> None:
+    round_ = make_round(choose="random")
+    assert ask(round_, policy=("training", 6)) is None
+    assert ask(round_, policy=("before", 7)) is None
+    assert ask(round_, policy=("", 0)) is None
+    assert ask(round_) is not None
+
+
+def test_random_situations_are_the_same_after_a_restart_and_others_in_each_round() -> None:
+    first, again, second = (
+        ask_all(make_round(number, choose="random", sequences=20)) for number in (1, 1, 2)
+    )
+    assert first == again
+    seeds = {correction.seed for correction in (*first, *second)}
+    assert len(seeds) == 40
+    assert all(seed in CORRECTIONS for seed in seeds)
+    assert all(dict(asked.situation) == dict(TASK.sample(asked.seed)) for asked in first)
+
+
+def test_tutored_cases_come_in_their_order() -> None:
+    def cases(number: int, **given: Any) -> list[int]:
+        asked = ask_all(make_round(number, choose="tutored", **given))
+        assert all(dict(one.situation) == dict(TASK.tutored()[one.seed]) for one in asked)
+        return [one.seed for one in asked]
+
+    assert cases(1, sequences=45) == cases(2, sequences=45) == list(range(45))
+    assert cases(2, sequences=30) == [*range(30, 45), *range(15)]
+    assert cases(1, sequences=60, cases=(3, 5, 8)) == [3, 5, 8]
+    assert make_round(choose="tutored", sequences=60).most == 45
+
+
+def test_the_situation_of_an_actor_that_is_gone_is_given_to_another() -> None:
+    round_ = make_round(choose="tutored")
+    asked = ask(round_, "mortal")
+    assert ask(round_, "other") != asked
+    round_.release("mortal")
+    assert ask(round_, "other") == asked
+
+
+def test_only_corrections_of_this_round_are_wanted_and_each_once(
+    correction: Callable[..., Episode],
+) -> None:
+    round_ = make_round(choose="tutored", sequences=1)
+    ours = correction(0)
+    for foreign in (
+        {"kind": Kind.TUTORING},
+        {"kind": Kind.PRACTICE},
+        {"policy_version": 6},
+        {"task": "reaching"},
+        {"seed": 1},
+    ):
+        other = replace(ours, **foreign)  # type: ignore[arg-type]
+        assert not round_.wants(other)
+        round_.shown(other)
+    assert round_.kept == 0
+    assert round_.wants(ours)
+    round_.shown(ours)
+    assert not round_.wants(ours)
+    assert round_.complete
+
+
+def test_what_was_asked_for_before_a_restart_is_welcome(
+    correction: Callable[..., Episode],
+) -> None:
+    round_ = make_round()  # knows of no failure any more
+    assert round_.wants(correction(77))
+    round_.shown(correction(77))
+    assert not round_.wants(correction(77))
+    round_.judge(verdict(78))
+    assert not round_.wants(correction(79)), "two are enough"
+    round_.shown(correction(78))
+    assert round_.complete

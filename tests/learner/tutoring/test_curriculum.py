@@ -1,0 +1,106 @@
+"""Every case is shown once, the clean executions first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from learner.tutoring.curriculum import Curriculum
+from proto.config import Config, LearnerConfig, PretrainingConfig, TutorConfig
+from proto.episode import Episode, Kind
+from proto.errors import UserError
+from proto.messages import TutoringCase
+
+MakeEpisode = Callable[..., Episode]
+
+
+AVAILABLE = {"experiment1": 45, "reaching": 15}
+
+
+def case(number: int, repeat: int, task: str = "experiment1") -> TutoringCase:
+    return TutoringCase(task, number, repeat)
+
+
+def curriculum(cases: tuple[int, ...] | None = (0, 7), repeats: int = 2) -> Curriculum:
+    config = Config(
+        learner=LearnerConfig(cases=cases, pretraining=PretrainingConfig(task=None)),
+        tutor=TutorConfig(repeats=repeats),
+    )
+    return Curriculum(config, AVAILABLE)
+
+
+def test_clean_executions_come_first() -> None:
+    plan = curriculum()
+    assert plan.sizes == {"experiment1": 4}
+    assert [plan.next_case("a") for _ in range(5)] == [
+        case(0, 0),
+        case(7, 0),
+        case(0, 1),
+        case(7, 1),
+        None,
+    ]
+
+
+def test_all_cases_unless_some_are_named() -> None:
+    assert curriculum(cases=None, repeats=4).sizes == {"experiment1": 180}
+
+
+def test_cases_of_pretraining_come_before_all_others(make_episode: MakeEpisode) -> None:
+    first = PretrainingConfig(cases=(0, 14), repeats=2)
+    config = Config(
+        learner=LearnerConfig(cases=(0,), pretraining=first), tutor=TutorConfig(repeats=1)
+    )
+    plan = Curriculum(config, AVAILABLE)
+    assert plan.sizes == {"reaching": 4, "experiment1": 1}
+    assert [plan.next_case("a") for _ in range(6)] == [
+        *(case(number, repeat, "reaching") for repeat in (0, 1) for number in (0, 14)),
+        case(0, 0),
+        None,
+    ]
+    # the same case of the other task has the same seed, and is another one
+    plan.shown([make_episode(kind=Kind.TUTORING, task="reaching", seed=0)])
+    assert plan.wants(make_episode(kind=Kind.TUTORING, task="experiment1", seed=0))
+    assert not plan.wants(make_episode(kind=Kind.TUTORING, task="reaching", seed=0))
+    assert plan.missing == 4
+
+
+@pytest.mark.parametrize("without", [{"epochs": 0}, {"task": None}])
+def test_pretraining_without_sequences_of_its_own(without: dict[str, Any]) -> None:
+    config = Config(learner=LearnerConfig(pretraining=PretrainingConfig(**without)))
+    assert Curriculum(config, AVAILABLE).sizes == {"experiment1": 180}
+
+
+def test_what_was_shown_is_not_handed_out_again(make_episode: MakeEpisode) -> None:
+    plan = curriculum()
+    shown = make_episode(kind=Kind.TUTORING, seed=case(7, 1).seed)
+    assert plan.wants(shown)
+    plan.shown([shown, shown])
+    assert not plan.wants(shown)
+    assert plan.missing == 3
+    assert case(7, 1) not in [plan.next_case("a") for _ in range(4)]
+
+
+def test_the_case_of_an_actor_that_is_gone_is_handed_out_again() -> None:
+    plan = curriculum()
+    assert plan.next_case("mortal") == case(0, 0)
+    assert plan.next_case("other") == case(7, 0)
+    plan.release("mortal")
+    assert plan.next_case("other") == case(0, 0)
+
+
+def test_only_the_tasks_own_tutored_cases_are_wanted(make_episode: MakeEpisode) -> None:
+    plan = curriculum()
+    assert not plan.wants(make_episode(kind=Kind.TRIAL, seed=0))
+    assert not plan.wants(make_episode(kind=Kind.TUTORING, seed=0, task="experiment9"))
+    assert not plan.wants(make_episode(kind=Kind.TUTORING, seed=1000))
+    assert plan.wants(make_episode(kind=Kind.TUTORING, seed=0))
+
+
+def test_a_case_that_there_is_not_is_named() -> None:
+    with pytest.raises(UserError, match=r"no case 45; the task experiment1 has .* 0 to 44"):
+        curriculum(cases=(3, 45))
+    first = PretrainingConfig(cases=(15,))
+    with pytest.raises(UserError, match=r"learner.pretraining.cases: .* 15; the task reaching"):
+        Curriculum(Config(learner=LearnerConfig(pretraining=first)), AVAILABLE)

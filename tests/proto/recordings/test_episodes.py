@@ -1,0 +1,215 @@
+"""What a recording gives back is what was put in, or a message that says what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from google.protobuf import message_factory
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import Message
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as stn
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
+from proto.episode import Episode, Kind, Outcome, Reason
+from proto.errors import UserError
+from proto.recordings.episodes import read_episode, write_episode
+from sim_assets.hand import MOTOR_NAMES
+
+OUTPUTS = 110
+
+
+MakeEpisode = Callable[..., Episode]
+
+
+def floats(*shape: int) -> st.SearchStrategy[np.ndarray]:
+    return stn.arrays(np.float32, shape, elements=st.floats(width=32))
+
+
+@st.composite
+def outcomes(draw: st.DrawFn) -> Outcome:
+    yes_or_no = [draw(st.booleans()) for _ in range(3)]
+    measures = [draw(st.floats()) for _ in range(6)]
+    steps = [draw(st.integers(-1, 200)) for _ in range(2)]
+    return Outcome(*yes_or_no, draw(st.sampled_from(Reason)), *measures, *steps)
+
+
+@st.composite
+def episodes(draw: st.DrawFn) -> Episode:
+    steps = draw(st.integers(0, 4))
+    names = draw(st.lists(st.text(max_size=8), max_size=3))
+    word = st.text(max_size=12)
+    return Episode(
+        id=draw(word),
+        kind=draw(st.sampled_from(Kind)),
+        task=draw(word),
+        situation=draw(st.dictionaries(word, st.floats(), max_size=3)),
+        seed=draw(st.integers(0, 2**64)),
+        actor=draw(word),
+        backend=draw(word),
+        policy=draw(word),
+        policy_version=draw(st.integers(0, 10**6)),
+        config_digest=draw(word),
+        images=draw(stn.arrays(np.uint8, (steps, IMAGE_HEIGHT, IMAGE_WIDTH))),
+        actions=draw(floats(steps, ACTION_SIZE)),
+        targets=draw(floats(steps, ACTION_SIZE)),
+        joints_deg=draw(floats(steps, len(JOINT_NAMES))),
+        phases=draw(stn.arrays(np.uint8, (steps,))),
+        body_names=tuple(names),
+        body_poses=draw(floats(steps, len(names), 7)),
+        outcome=draw(outcomes()),
+        outputs=draw(st.none() | floats(steps, OUTPUTS)),
+        control_period_s=draw(st.floats(0.001, 10.0)),
+        states=draw(st.none() | st.dictionaries(word, floats(steps, 7), max_size=3)),
+    )
+
+
+def same(one: object, other: object) -> bool:
+    """Equal to the last bit, where NaN equals NaN."""
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return one.dtype == other.dtype and np.array_equal(
+            one, other, equal_nan=one.dtype.kind == "f"
+        )
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, Outcome) and isinstance(other, Outcome):
+        return same(vars(one), vars(other))
+    return type(one) is type(other) and repr(one) == repr(other)
+
+
+@settings(max_examples=60)
+@given(episode=episodes())
+def test_every_field_comes_back_exactly(
+    episode: Episode, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("round") / "episode.mcap"
+    write_episode(path, episode)
+    again = read_episode(path)
+    for item in fields(Episode):
+        assert same(getattr(again, item.name), getattr(episode, item.name)), item.name
+
+
+def test_an_episode_without_states_is_recorded_as_before_there_were_any(
+    tmp_path: Path, make_episode: MakeEpisode
+) -> None:
+    path = tmp_path / "episode.mcap"
+    write_episode(path, make_episode(3))
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        assert "/states" not in {channel.topic for channel in summary.channels.values()}
+        (told,) = (r.metadata for r in make_reader(stream).iter_metadata() if r.name == "episode")
+    assert "states" not in told
+
+
+def test_joint_names_agree_with_the_hand() -> None:
+    assert JOINT_NAMES[-len(MOTOR_NAMES) :] == MOTOR_NAMES
+    assert len(JOINT_NAMES) == 18
+
+
+def test_another_mcap_reader_understands_it(tmp_path: Path, make_episode: MakeEpisode) -> None:
+    """With nothing but the file: index, schemas, times and metadata, as Foxglove reads them."""
+    path, episode = tmp_path / "episode.mcap", make_episode()
+    write_episode(path, episode)
+    seen: dict[str, list[Message]] = {}
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            files = FileDescriptorSet.FromString(schema.data).file
+            decoder = message_factory.GetMessages(list(files))[schema.name]
+            step = len(seen.setdefault(channel.topic, []))
+            assert message.log_time == round(step * episode.control_period_s * 1e9)
+            seen[channel.topic].append(decoder.FromString(message.data))
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+    assert {topic: messages[0].DESCRIPTOR.full_name for topic, messages in seen.items()} == {
+        "/eye": "foxglove.CompressedImage",
+        "/joints": "foxglove.JointStates",
+        "/tf": "foxglove.FrameTransforms",
+        "/step": "vmdnn.Step",
+    }
+    assert all(len(messages) == episode.steps for messages in seen.values())
+    last_joints, last_step = seen["/joints"][-1], seen["/step"][-1]
+    assert [joint.name for joint in last_joints.joints] == list(JOINT_NAMES)
+    assert last_joints.joints[5].position == pytest.approx(np.radians(episode.joints_deg[-1, 5]))
+    assert last_step.action.r_elbow == episode.actions[-1, 5]
+    assert [frame.child_frame_id for frame in seen["/tf"][0].transforms] == ["object", "obstacle"]
+    assert metadata["outcome"]["reason"] == "imprecise"
+    assert metadata["situation"] == {
+        "object_y": "0.25",
+        "object_yaw": "-22.5",
+        "obstacle_x": "-0.27",
+    }
+    assert metadata["episode"]["seed"] == "3001"
+    assert metadata["episode"]["config_digest"] == "c0ffee"
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_a_file_cut_off_anywhere_is_refused(
+    data: st.DataObject, make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("cut") / "episode.mcap"
+    write_episode(path, make_episode())
+    whole = path.read_bytes()
+    path.write_bytes(whole[: data.draw(st.integers(0, len(whole) - 1))])
+    with pytest.raises(UserError, match=rf"vmdnn recover {path}"):
+        read_episode(path)
+
+
+@settings(max_examples=150)
+@given(data=st.data())
+def test_a_flipped_byte_is_refused_or_harmless(
+    data: st.DataObject, make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path, episode = tmp_path_factory.mktemp("flip") / "episode.mcap", make_episode(12)
+    write_episode(path, episode)
+    damaged = bytearray(path.read_bytes())
+    damaged[data.draw(st.integers(0, len(damaged) - 1))] ^= data.draw(st.integers(1, 255))
+    path.write_bytes(damaged)
+    try:
+        again = read_episode(path)
+    except UserError:
+        return
+    for item in fields(Episode):
+        assert same(getattr(again, item.name), getattr(episode, item.name)), item.name
+
+
+def test_what_is_no_recording_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="No such file"):
+        read_episode(tmp_path / "missing.mcap")
+    text = tmp_path / "notes.mcap"
+    text.write_text("this is no MCAP file, whatever its name says")
+    with pytest.raises(UserError, match="not an MCAP file"):
+        read_episode(text)
+    foreign = tmp_path / "foreign.mcap"
+    with foreign.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.finish()
+    with pytest.raises(UserError, match="no episode"):
+        read_episode(foreign)
+
+
+def test_a_failed_write_keeps_the_old_file(tmp_path: Path, make_episode: MakeEpisode) -> None:
+    path = tmp_path / "episode.mcap"
+    write_episode(path, make_episode())
+    before = path.read_bytes()
+    broken = make_episode(joints_deg=make_episode().joints_deg[:, :5])
+    with pytest.raises(ValueError, match="shorter"):
+        write_episode(path, broken)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path, make_episode: MakeEpisode) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be written"):
+        write_episode(tmp_path / "file" / "episode.mcap", make_episode())

@@ -1,0 +1,161 @@
+"""What was whole before a kill comes back; what was there before is never lost."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from proto.episode import Episode
+from proto.errors import UserError
+from proto.recordings.episodes import read_episode, write_episode
+from proto.recordings.recovery import recover
+from services.cli import main
+
+MakeEpisode = Callable[..., Episode]
+
+STEPS = 125
+
+
+@pytest.fixture(scope="module")
+def episode(make_episode: MakeEpisode) -> Episode:
+    return make_episode(STEPS)
+
+
+@pytest.fixture(scope="module")
+def recording(episode: Episode, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The bytes of a whole recording."""
+    path = tmp_path_factory.mktemp("whole") / "episode.mcap"
+    write_episode(path, episode)
+    return path.read_bytes()
+
+
+def assert_is_start_of(part: Episode, whole: Episode) -> None:
+    assert (part.id, part.outcome, part.situation) == (whole.id, whole.outcome, whole.situation)
+    for name in ("images", "actions", "targets", "joints_deg", "phases", "body_poses", "outputs"):
+        assert np.array_equal(getattr(part, name), getattr(whole, name)[: part.steps]), name
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_a_file_cut_off_anywhere_keeps_its_whole_steps(
+    data: st.DataObject,
+    recording: bytes,
+    episode: Episode,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    path = tmp_path_factory.mktemp("cut") / "episode.mcap"
+    size = data.draw(st.integers(0, len(recording) - 1))
+    path.write_bytes(recording[:size])
+    try:
+        found = recover(path)
+    except UserError:
+        # Nothing is lost by refusing: at most the first chunk was there.
+        assert size < len(recording) / 5
+        assert path.read_bytes() == recording[:size]
+        return
+    part = read_episode(path, partial=True)
+    assert_is_start_of(part, episode)
+    assert not found.intact
+    assert (found.steps, found.steps_played) == (part.steps, STEPS)
+    # One chunk at most is lost: what was kept is not much less than what was there.
+    assert part.steps / STEPS > size / len(recording) - 0.2
+    assert recover(path).intact
+
+
+def test_a_process_killed_while_recording_leaves_a_recoverable_file(
+    recording: bytes, episode: Episode, tmp_path: Path
+) -> None:
+    """The other process would need many seconds to write it all; it is killed long before."""
+    source, target = tmp_path / "short.mcap", tmp_path / "long.mcap"
+    script = f"""
+from dataclasses import replace
+from pathlib import Path
+import numpy as np
+from proto.recordings.episodes import read_episode, write_episode
+episode = read_episode(Path({str(source)!r}))
+arrays = {{
+    name: np.concatenate([getattr(episode, name)] * 500)
+    for name in ("images", "actions", "targets", "joints_deg", "phases", "body_poses", "outputs")
+}}
+write_episode(Path({str(target)!r}), replace(episode, **arrays))
+"""
+    source.write_bytes(recording)
+    process = subprocess.Popen([sys.executable, "-c", script])
+    try:
+        part = _wait_for_part(target, process, size=300_000)
+    finally:
+        process.kill()
+        process.wait()
+    assert not target.exists()
+    with pytest.raises(UserError, match="vmdnn recover"):
+        read_episode(part)
+    cut_off = part.read_bytes()
+    assert main(["recover", str(part), "--out", str(target)]) == 0
+    assert part.read_bytes() == cut_off
+    recovered = read_episode(target, partial=True)
+    assert recovered.steps > 10
+    repeats = -(-recovered.steps // episode.steps)
+    expected = np.concatenate([episode.actions] * repeats)[: recovered.steps]
+    assert np.array_equal(recovered.actions, expected)
+
+
+def _wait_for_part(target: Path, process: subprocess.Popen[bytes], size: int) -> Path:
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and process.poll() is None:
+        for part in target.parent.glob(f"{target.name}.*.part"):
+            if part.stat().st_size > size:
+                return part
+        time.sleep(0.01)
+    raise AssertionError("the other process never wrote enough")
+
+
+def test_a_repaired_episode_is_not_taken_for_a_whole_one(recording: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "episode.mcap"
+    path.write_bytes(recording[: len(recording) // 2])
+    assert main(["recover", str(path)]) == 0
+    with pytest.raises(UserError, match=rf"of {STEPS} steps, recovered from a file that was cut"):
+        read_episode(path)
+
+
+def test_an_intact_file_is_left_alone(
+    recording: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, copy = tmp_path / "episode.mcap", tmp_path / "copy.mcap"
+    path.write_bytes(recording)
+    before = path.stat()
+    assert main(["recover", str(path)]) == 0
+    assert f"is whole ({4 * STEPS} messages, {STEPS} of {STEPS} steps)" in capsys.readouterr().out
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+    assert main(["recover", str(path), "--out", str(copy)]) == 0
+    assert read_episode(copy).id == read_episode(path).id
+
+
+def test_a_repair_that_cannot_be_written_changes_nothing(
+    recording: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, blocked = tmp_path / "episode.mcap", tmp_path / "folder"
+    path.write_bytes(recording[:-100])
+    blocked.mkdir()
+    assert main(["recover", str(path), "--out", str(blocked)]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+    assert path.read_bytes() == recording[:-100]
+    assert sorted(tmp_path.iterdir()) == [path, blocked]
+
+
+@pytest.mark.parametrize("content", [b"", b"not an MCAP file at all"])
+def test_what_holds_nothing_is_refused(
+    content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "episode.mcap"
+    path.write_bytes(content)
+    assert main(["recover", str(path)]) == 2
+    assert str(path) in capsys.readouterr().err
+    assert path.read_bytes() == content

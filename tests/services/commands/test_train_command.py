@@ -1,0 +1,202 @@
+"""`vmdnn train` and `vmdnn inspect` as they are used."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from learner.checkpoint import load_checkpoint, policy_file, pretraining_file, training_file
+from learner.training.trainer import Trainer
+from learner.tutoring.store import TutoringStore
+from proto.episode import Episode
+from services.cli import main
+
+CONFIG = {
+    "network": {
+        "mstnn_fast": {"maps": 2, "kernel": [14, 10], "stride": 2, "tau": 2},
+        "mstnn_slow": {"maps": 3, "kernel": [8, 6], "stride": 2, "tau": 5},
+        "pfc": {"units": 8, "tau": 20},
+    },
+    "learner": {
+        "epochs": 6,
+        "checkpoint_every_epochs": 4,
+        "publish_every_epochs": 2,
+        "pretraining": {"epochs": 2, "labels": {"object_y": 2}},
+    },
+}
+
+
+@pytest.fixture
+def data(tmp_path: Path, make_episode: Callable[..., Episode]) -> Path:
+    store = TutoringStore(tmp_path / "data")
+    for steps in (9, 10, 11):
+        store.add(make_episode(steps, id=f"of-{steps}", situation={"object_y": steps / 40}))
+    return store.folder
+
+
+@pytest.fixture
+def train(tmp_path: Path, data: Path) -> Callable[..., int]:
+    config = tmp_path / "small.yaml"
+    config.write_text(yaml.safe_dump(CONFIG))
+
+    def run(out: Path, *more: str) -> int:
+        words = ["train", "--data", str(data), "--config", str(config), "--out", str(out)]
+        return main([*words, *more])
+
+    return run
+
+
+def test_it_leaves_policies_a_checkpoint_and_the_config(
+    tmp_path: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out, "--set", "learner.batch=2") == 0
+    versions = [load_checkpoint(policy_file(out, n)).metadata for n in (1, 2, 3)]
+    assert [(m.version, m.epoch) for m in versions] == [(1, 2), (2, 4), (3, 6)]
+    assert load_checkpoint(training_file(out)).metadata.epoch == 6
+    assert yaml.safe_load((out / "config.yaml").read_text())["learner"]["batch"] == 2
+    printed = capsys.readouterr().out
+    assert "coupled epoch 6/6" in printed
+    assert f"policy 3: {policy_file(out, 3)}" in printed
+
+    assert train(out) == 0
+    assert "is trained already" in capsys.readouterr().out
+
+
+def test_what_the_vision_tells_can_be_looked_at(
+    tmp_path: Path, data: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out) == 0
+    words = ["inspect", "vision", "--data", str(data), "--test", str(data)]
+    assert main([*words, str(pretraining_file(out))]) == 0
+    printed = capsys.readouterr().out
+    assert "The classifier, 3 sequences" in printed
+    assert "5 reach above object" in printed
+
+    assert main([*words, str(policy_file(out, 3)), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["sequences"], found["classifier"]) == (3, [])
+    assert {told["value"] for told in found["regression"]} == {"object_y"}
+
+
+@pytest.mark.parametrize("pressed_at", [1, 5])
+def test_ctrl_c_saves_and_the_same_command_goes_on_exactly(
+    tmp_path: Path,
+    train: Callable[..., int],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    pressed_at: int,
+) -> None:
+    """Pressed in the middle of pre-training, and of coupled training."""
+    undisturbed, disturbed = tmp_path / "undisturbed", tmp_path / "disturbed"
+    assert train(undisturbed) == 0
+
+    epoch, epochs = Trainer.epoch, iter(range(1, 100))
+
+    def epoch_and_ctrl_c(trainer: Trainer) -> float:
+        if next(epochs) == pressed_at:
+            signal.raise_signal(signal.SIGINT)
+        return epoch(trainer)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Trainer, "epoch", epoch_and_ctrl_c)
+        assert train(disturbed) == 130
+    assert "the same command goes on" in capsys.readouterr().out
+    assert train(disturbed) == 0
+    for path in (training_file, lambda run: policy_file(run, 3)):
+        assert path(disturbed).read_bytes() == path(undisturbed).read_bytes()
+
+
+def test_a_second_ctrl_c_ends_at_once(
+    tmp_path: Path, train: Callable[..., int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def press_twice(_trainer: Trainer) -> float:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("still here")
+
+    monkeypatch.setattr(Trainer, "epoch", press_twice)
+    assert train(tmp_path / "run") == 130
+
+
+def complaint_of(status: int, capsys: pytest.CaptureFixture[str]) -> str:
+    assert status == 2
+    return capsys.readouterr().err
+
+
+def test_folder_of_data_that_is_missing_or_empty(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    missing, empty, out = tmp_path / "missing", tmp_path / "empty", tmp_path / "run"
+    empty.mkdir()
+    status = main(["train", "--data", str(missing), "--out", str(out)])
+    assert "missing is no folder; record one with `vmdnn tutor" in complaint_of(status, capsys)
+    status = main(["train", "--data", str(empty), "--out", str(out)])
+    assert "empty holds no sequence" in complaint_of(status, capsys)
+    assert not out.exists()
+
+
+def test_data_of_which_nothing_can_be_read(
+    tmp_path: Path, data: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in data.iterdir():
+        path.write_bytes(path.read_bytes()[:300])
+    complaint = complaint_of(train(tmp_path / "run"), capsys)
+    assert "none of the 3 sequences" in complaint
+    assert "vmdnn recover" in complaint
+
+
+def test_run_of_another_network_is_left_as_it_was(
+    tmp_path: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out) == 0
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    complaint = complaint_of(train(out, "--set", "network.pfc.tau=30"), capsys)
+    assert "network.pfc.tau: 20.0 in the checkpoint, 30.0 in the config" in complaint
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+
+
+def test_inspect_network_prints_what_the_paper_says(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", "network", "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["mstnn_fast"] == {
+        "name": "mstnn_fast",
+        "symbol": "V_F",
+        "shape": [3, 22, 18],
+        "tau": 2,
+        "kernel": [22, 14],
+        "stride": 2,
+        "weights": 3 * 22 * 14,
+        "biases": 3,
+    }
+    assert rows["pfc"]["weights"] == 20 * (6 * 8 * 7) + 20 * 20 + 20 * 30
+    assert rows["outputs"]["shape"] == [11, 10]
+
+    assert main(["inspect", "network", "--set", "network.mtrnn_slow.units=31"]) == 0
+    assert "mtrnn_slow" in capsys.readouterr().out
+
+
+def test_inspect_checkpoint_prints_its_metadata(
+    tmp_path: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train(tmp_path / "run") == 0
+    capsys.readouterr()
+    assert main(["inspect", "checkpoint", str(policy_file(tmp_path / "run", 2)), "--json"]) == 0
+    metadata = json.loads(capsys.readouterr().out)
+    assert (metadata["version"], metadata["stage"], metadata["epoch"]) == (2, "coupled", 4)
+    assert np.isfinite(metadata["loss"])
+    assert metadata["network"]["pfc"] == {"units": 8, "tau": 20}
+    assert len(metadata["code"]["minima"]) == 11
+
+    foreign = tmp_path / "foreign.safetensors"
+    foreign.write_bytes(b"not a checkpoint")
+    complaint = complaint_of(main(["inspect", "checkpoint", str(foreign)]), capsys)
+    assert "foreign.safetensors is not a checkpoint, or is damaged" in complaint

@@ -1,0 +1,92 @@
+"""The doctor finds what is wrong and says what to do."""
+
+from __future__ import annotations
+
+import json
+import socket
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from services.cli import main
+from services.machine.doctor import (
+    LOCK,
+    check_cores,
+    check_disk,
+    check_kernel,
+    check_memory,
+    check_packages,
+    check_port,
+    check_python,
+    read_lock,
+)
+from tests.ports import free_endpoint
+
+
+def test_this_machine_is_well(capsys: pytest.CaptureFixture[str]) -> None:
+    status = main(["doctor", "--json", "--set", f"hub.endpoint={free_endpoint()}"])
+    findings = {finding["check"]: finding for finding in json.loads(capsys.readouterr().out)}
+    assert set(findings) == {
+        "python", "packages", "cores", "memory", "disk", "hub port", "kernel", "graphics",
+    }  # fmt: skip
+    assert findings["graphics"]["ok"], findings["graphics"]
+    assert status == (0 if all(finding["ok"] for finding in findings.values()) else 1)
+
+
+def test_a_problem_gives_status_1_and_advice(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        endpoint = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        assert main(["doctor", "--set", f"hub.endpoint={endpoint}"]) == 1
+    output = capsys.readouterr().out
+    assert f"PROBLEM hub port: {endpoint}" in output
+    assert "choose another port with --set hub.endpoint=" in output
+
+
+def test_the_lock_is_installed_exactly() -> None:
+    finding = check_packages(LOCK)
+    assert finding.ok, finding
+
+
+def test_other_and_missing_packages_are_named(tmp_path: Path) -> None:
+    lock = tmp_path / "requirements.lock"
+    lock.write_text(f"# a comment\nnumpy=={version('numpy')}\nrich==0.0.1\nno-such-package==1.0\n")
+    finding = check_packages(lock)
+    assert not finding.ok
+    assert f"rich {version('rich')} instead of 0.0.1" in finding.found
+    assert "no-such-package missing instead of 1.0" in finding.found
+    assert "numpy" not in finding.found
+    assert str(lock) in finding.advice
+
+
+def test_without_a_lock_it_says_where_to_run(tmp_path: Path) -> None:
+    assert "checkout" in check_packages(tmp_path / "requirements.lock").advice
+
+
+def test_too_little_of_anything_is_a_problem(tmp_path: Path) -> None:
+    assert not check_cores(1).ok
+    assert check_cores(2).ok
+    assert not check_memory(0.4).ok
+    assert check_memory(8.0).ok
+    assert check_disk(tmp_path / "not" / "yet" / "there").found.endswith(str(tmp_path))
+    assert check_python().ok
+
+
+def test_without_a_compiler_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.delenv("CXX", raising=False)
+    assert "apt-get install g++" in check_kernel().advice
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "no.such.host.invalid"])
+def test_an_endpoint_that_is_not_ours_is_a_problem(host: str) -> None:
+    assert "an address of this machine" in check_port(f"tcp/{host}:7447").advice
+
+
+def test_the_lock_holds_what_the_project_asks_for() -> None:
+    locked = read_lock(LOCK)
+    assert locked["torch"] == "2.13.0"
+    assert "opencv-python" not in locked, "it overwrites opencv-python-headless"

@@ -1,0 +1,110 @@
+"""A replay is a video with one frame a step that shows the episode."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from proto.episode import Episode
+from proto.recordings.episodes import read_episode, write_episode
+from services.cli import main
+
+STEPS = (0, 60, 120)
+"""Rendering takes a while: the tests replay these steps of an episode only."""
+
+
+@pytest.fixture(scope="module")
+def short(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording of few steps that lie far apart."""
+    episode = read_episode(recordings / "case03_repeat00.mcap")
+    path = tmp_path_factory.mktemp("short") / "episode.mcap"
+    write_episode(path, steps_of(episode, list(STEPS)))
+    return path
+
+
+def steps_of(episode: Episode, steps: list[int]) -> Episode:
+    names = ("images", "actions", "targets", "joints_deg", "phases", "body_poses")
+    return replace(episode, **{name: getattr(episode, name)[steps] for name in names})
+
+
+def read_video(path: Path) -> tuple[list[np.ndarray], float]:
+    video = cv2.VideoCapture(str(path))
+    assert video.isOpened()
+    frames = []
+    while (frame := video.read())[0]:
+        frames.append(frame[1])
+    return frames, video.get(cv2.CAP_PROP_FPS)
+
+
+def test_the_video_shows_both_views_of_every_step(short: Path, tmp_path: Path) -> None:
+    out = tmp_path / "videos" / "episode.mp4"
+    assert main(["replay", str(short), "--out", str(out), "--fps", "5"]) == 0
+    frames, fps = read_video(out)
+    assert len(frames) == len(STEPS)
+    assert fps == pytest.approx(5)
+    assert {frame.shape for frame in frames} == {(480, 1280, 3)}
+    assert list(out.parent.iterdir()) == [out]
+    for frame in frames:
+        outside, eye = frame[150:, :640].astype(int), frame[150:, 640:].astype(int)
+        for view in (outside, eye):
+            assert view.std() > 20, "something is to be seen"
+        red = (outside[..., 2] - outside[..., :2].max(axis=2)) > 60
+        assert red.any(), "the object, or the robot's cover"
+    for before, after in pairwise(frames):
+        moved = cv2.absdiff(before, after)[150:]
+        assert (moved > 50).any(axis=2)[:, :640].sum() > 500
+        assert (moved > 50).any(axis=2)[:, 640:].sum() > 500
+
+
+def test_the_recorded_picture_agrees_with_the_rendered_view(short: Path, tmp_path: Path) -> None:
+    """The inset is what the network was given; the frame says where it lies in the eye's view."""
+    out = tmp_path / "episode.mp4"
+    assert main(["replay", str(short), "--out", str(out)]) == 0
+    frames, fps = read_video(out)
+    episode = read_episode(short)
+    assert fps == pytest.approx(1 / episode.control_period_s)
+    inset = cv2.cvtColor(frames[0], cv2.COLOR_BGR2GRAY)[-145:-1, -193:-1]
+    shown = cv2.resize(inset, (64, 48), interpolation=cv2.INTER_AREA)
+    assert np.abs(shown.astype(int) - episode.images[0]).mean() < 6
+    # at step 0 the focus is wide: the crop is the whole view
+    view = cv2.cvtColor(frames[0], cv2.COLOR_BGR2GRAY)[:, 640:]
+    small = cv2.resize(view, (64, 48), interpolation=cv2.INTER_AREA)[5:30, :40]
+    assert np.abs(small.astype(int) - episode.images[0][5:30, :40]).mean() < 12
+
+
+def test_a_recovered_episode_can_be_seen(recordings: Path, tmp_path: Path) -> None:
+    path, out = tmp_path / "cut.mcap", tmp_path / "cut.mp4"
+    whole = (recordings / "case03_repeat00.mcap").read_bytes()
+    path.write_bytes(whole[: len(whole) // 8])
+    assert main(["replay", str(path), "--out", str(out)]) == 2
+    assert main(["recover", str(path)]) == 0
+    recovered = read_episode(path, partial=True)
+    write_episode(path, steps_of(recovered, [recovered.steps - 1]))
+    assert main(["replay", str(path), "--out", str(out)]) == 0
+    assert len(read_video(out)[0]) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--out", "video.avi"], "must end in .mp4"),
+        (["--out", "video.mp4", "--backend", "nothing"], "no backend 'nothing'"),
+    ],
+)
+def test_bad_input_says_what_to_do(
+    arguments: list[str],
+    message: str,
+    short: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["replay", str(short), *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,69 @@
+"""Each trial counts once, whatever is killed and started again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from proto.episode import Episode, Kind
+from proto.messages import Rollout
+from services.trials.trial_log import TrialLog
+
+MakeEpisode = Callable[..., Episode]
+
+
+@pytest.fixture
+def trial(make_episode: MakeEpisode) -> Callable[..., Rollout]:
+    def make(seed: int, version: int = 1, run_id: str = "run") -> Rollout:
+        episode = make_episode(
+            2, kind=Kind.TRIAL, seed=seed, policy_version=version, id=f"{seed}-{version}-{run_id}"
+        )
+        return Rollout(episode, run_id)
+
+    return make
+
+
+def test_a_trial_counts_once_for_each_policy(tmp_path: Path, trial: Callable[..., Rollout]) -> None:
+    path = tmp_path / "evaluation" / "trials.jsonl"
+    book = TrialLog(path)
+    assert [book.add(trial(seed)) for seed in (5, 6, 5)] == [True, True, False]
+    assert book.add(trial(5, version=2))
+    assert book.add(trial(5, run_id="another"))
+    again = TrialLog(path)
+    for known in (book, again):
+        assert known.versions("run") == [1, 2]
+        assert sorted(known.outcomes("run", 1)) == [5, 6]
+        assert known.outcomes("run", 1)[5] == trial(5).episode.outcome
+        assert known.outcomes("another", 7) == {}
+    assert not again.add(trial(6))
+    assert len(path.read_text().splitlines()) == 4
+
+
+@pytest.mark.parametrize("kept", [1, 40, -1])
+def test_a_line_cut_off_by_a_kill_is_dropped_and_counted_anew(
+    tmp_path: Path, trial: Callable[..., Rollout], kept: int
+) -> None:
+    path = tmp_path / "trials.jsonl"
+    TrialLog(path).add(trial(1))
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole.replace(b'"seed": 1', b'"seed": 2')[:kept])
+    book = TrialLog(path)
+    assert sorted(book.outcomes("run", 1)) == [1]
+    assert path.read_bytes() == whole
+    assert book.add(trial(2))
+    assert sorted(TrialLog(path).outcomes("run", 1)) == [1, 2]
+
+
+def test_a_damaged_line_is_skipped_and_told(
+    tmp_path: Path, trial: Callable[..., Rollout], caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "trials.jsonl"
+    book = TrialLog(path)
+    for seed in (1, 2, 3):
+        book.add(trial(seed))
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(lines[0] + lines[1].replace(b'"strict"', b'"strikt"') + lines[2])
+    assert sorted(TrialLog(path).outcomes("run", 1)) == [1, 3]
+    assert "line 2 is not counted: outcome" in caplog.text
