@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from safetensors.numpy import save as save_tensors
 from learner.network.softmax_code import SoftmaxCode
 from learner.network.subnets import parameter_shapes
 from learner.pretrained import checkpoint_path
-from proto.body import ACTION_SIZE
+from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import NetworkConfig, RivalKind
 from proto.errors import UserError
 from proto.metrics import Stage
@@ -81,7 +81,7 @@ class CheckpointMetadata(_Model):
         epoch: epochs of that stage that are done.
         loss: loss of the last of them, or None.
         config_digest: digest of the effective configuration.
-        network: the network; of a rival only its pictures and outputs.
+        network: the network; of a rival only its outputs count.
         code: ranges of the outputs; None as long as the network cannot act.
         cases: different situations that this stage has learned from; 0 if that was not counted.
         sequences: sequences that it has learned from; 0 if that was not counted.
@@ -161,13 +161,7 @@ def checkpoint_from_bytes(blob: bytes, origin: str) -> Checkpoint:
             f"{origin} is a safetensors file, but not of vmdnn: it lacks the metadata"
             f" {_METADATA_KEY!r}"
         ) from error
-    try:
-        metadata = CheckpointMetadata.model_validate_json(text)
-    except ValidationError as error:
-        raise UserError(
-            f"{origin} was written by another version of vmdnn, or is damaged: {error}"
-        ) from error
-    checkpoint = Checkpoint(metadata, tensors)
+    checkpoint = Checkpoint(_metadata(text, origin), tensors)
     _check_tensors(checkpoint, origin)
     return checkpoint
 
@@ -224,6 +218,28 @@ def _fields(network: NetworkConfig) -> dict[str, object]:
         else:
             fields[f"network.{name}"] = value
     return fields
+
+
+def _metadata(text: str, origin: str) -> CheckpointMetadata:
+    try:
+        values = json.loads(text)
+        if isinstance(values, dict) and isinstance(values.get("network"), dict):
+            _drop_image_size(values["network"], origin)
+        return CheckpointMetadata.model_validate(values)
+    except (json.JSONDecodeError, ValidationError) as error:
+        raise UserError(
+            f"{origin} was written by another version of vmdnn, or is damaged: {error}"
+        ) from error
+
+
+def _drop_image_size(network: dict[str, Any], origin: str) -> None:
+    """Drop the image size, which earlier checkpoints of format 1 name among the network's sizes."""
+    size = network.pop("image", [IMAGE_WIDTH, IMAGE_HEIGHT])
+    if size != [IMAGE_WIDTH, IMAGE_HEIGHT]:
+        raise UserError(
+            f"{origin} is of a network for images of the size {size} (width, height), but the"
+            f" robot's images are {IMAGE_WIDTH} x {IMAGE_HEIGHT}; take another checkpoint"
+        )
 
 
 def _check_tensors(checkpoint: Checkpoint, origin: str) -> None:

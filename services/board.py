@@ -30,6 +30,7 @@ from proto.metrics import (
     Stage,
     Success,
 )
+from services.terminal.rates import interval_text, percent_text
 
 LINES_PERIOD_S: Final = 5.0
 """How often a line is written where there is no terminal."""
@@ -176,11 +177,8 @@ def summary_line(view: View) -> str:
 
 def success_words(success: Success, trials: int) -> str:
     """Such as `8 of 12, 67 % (39 to 86)`: successes, rate and Wilson interval in percent."""
-    low, high = success.wilson95
-    return (
-        f"{success.successes} of {trials}, "
-        f"{100 * success.rate:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
-    )
+    rate, interval = percent_text(success.rate, 0), interval_text(success.wilson95, 0)
+    return f"{success.successes} of {trials}, {rate} % ({interval})"
 
 
 def tables(view: View) -> RenderableType:

@@ -1,8 +1,8 @@
 """Pre-training of the vision as a delayed-response classifier (paper, section 3.3).
 
-The network watches a whole sequence. Only at its end it is asked, through a temporary softmax on
-the PFC, where the object was and how it lay. What answers are asked for, and in how many classes,
-is in the config. The temporary layer goes when coupled training begins.
+The network watches a whole sequence. At its end a temporary softmax layer on the PFC classifies
+the situation: where the object is and how it lies. The config names the values and the number of
+classes of each. The temporary layer is dropped when coupled training begins.
 """
 
 from __future__ import annotations
@@ -16,33 +16,42 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from learner.network.mtrnn import run_levels
-from learner.network.vision_input import vision_input
+from learner.network.softmax_code import SoftmaxCode
 from learner.network.vmdnn import VMDNN
-from learner.training.augmentation import disturbed
+from learner.training.augmentation import augmented_input
+from learner.training.divergence import backward
 from learner.training.loss import kl_divergence
 from proto.config import PretrainingConfig
 from proto.episode import Episode, Image
 
 Classes = Mapping[str, tuple[float, ...]]
-"""Centres of the classes, by name of the situation's value."""
+"""Centres of the classes, by name of a value of the situation."""
 
 
 def classes_of(episodes: Sequence[Episode], labels: Mapping[str, int]) -> Classes:
-    """As many classes for each value as `labels` says, evenly over the episodes' situations."""
+    """Classes that cover the episodes' situations evenly.
+
+    Args:
+        episodes: not empty.
+        labels: number of classes by name of the situation's value.
+    """
     return {
-        name: _spread([episode.situation[name] for episode in episodes], count)
+        name: _centres([episode.situation[name] for episode in episodes], count)
         for name, count in labels.items()
     }
 
 
 class Pretraining:
-    """Sequences, classifier and loss of pre-training.
+    """Objective of pre-training: classification of sequences.
 
     Attributes:
+        code: always None; the network cannot act yet.
         classes: centres of the classes.
-        classifier: the temporary layer, PFC to all classes.
-        parameters: what is trained: V_F, V_S, what enters the PFC and its recurrence, classifier.
+        classifier: the temporary layer, from the PFC to all classes.
+        parameters: what is trained: V_F, V_S, the PFC without feedback, and the classifier.
     """
+
+    code: SoftmaxCode | None = None
 
     def __init__(
         self,
@@ -51,13 +60,13 @@ class Pretraining:
         config: PretrainingConfig,
         generator: torch.Generator,
     ) -> None:
-        """Put the temporary layer on the network.
+        """Put the temporary layer on the network; start without sequences.
 
         Args:
-            network: the network whose vision is to be formed.
-            classes: what is asked for; not empty.
-            config: when the answer is asked for, and how pictures are disturbed.
-            generator: draws the temporary layer's weights and the disturbance.
+            network: the network; its vision and PFC are trained.
+            classes: the classes; not empty.
+            config: in which part of a sequence it is classified, and how images are augmented.
+            generator: draws the temporary layer's weights and the augmentation.
         """
         self.classes = classes
         self._network = network
@@ -82,7 +91,7 @@ class Pretraining:
         return len(self._images)
 
     def add(self, episode: Episode) -> None:
-        """Take a sequence in; a situation outside the classes counts as the nearest one."""
+        """Add a sequence; a value outside the classes is learned as the outermost class."""
         labels = [
             soft_label(episode.situation[name], centres) for name, centres in self.classes.items()
         ]
@@ -90,21 +99,20 @@ class Pretraining:
         self._images.append(episode.images)
 
     def add_gradients(self, chosen: Tensor) -> float:
-        """`loss`; its gradients are added to the parameters' `grad`."""
-        loss = self.loss(chosen)
-        loss.backward()  # type: ignore[no-untyped-call]
-        return loss.item()
+        """`loss`; adds its gradients to the parameters' `grad`."""
+        return backward(self.loss(chosen))
 
     def loss(self, chosen: Tensor) -> Tensor:
-        """Mean divergence of the answers to the labels, for the sequences with these indices."""
+        """Mean divergence of classifier and labels, for the sequences with these indices."""
         indices = chosen.tolist()
         images = [self._images[index] for index in indices]
         labels = torch.from_numpy(np.stack([self._labels[index] for index in indices]))
-        answers = self.classifier(run_levels([self._network.pfc], self._see(images), "bottom_up"))
-        asked = self._asked([len(image) for image in images])
+        seen = self._network.see(augmented_input(images, self._config, self._generator))
+        answers = self.classifier(run_levels([self._network.pfc], seen, "bottom_up"))
+        mask = self._answer_mask([len(image) for image in images])
         losses = [
             kl_divergence(
-                functional.log_softmax(answer, dim=-1).unsqueeze(2), label[:, None, None], asked
+                functional.log_softmax(answer, dim=-1).unsqueeze(2), label[:, None, None], mask
             )
             for answer, label in zip(
                 torch.split(answers, self._counts, dim=-1),
@@ -114,14 +122,8 @@ class Pretraining:
         ]
         return torch.stack(losses).mean()
 
-    def _see(self, images: Sequence[Image]) -> Tensor:
-        """V_S (B, T, units) for pictures of any lengths T; filled up at the end with black."""
-        grey = nn.utils.rnn.pad_sequence([torch.from_numpy(each) for each in images], True)
-        seen = torch.from_numpy(vision_input(grey.numpy()))
-        return self._network.see(disturbed(seen, self._config, self._generator))
-
-    def _asked(self, lengths: Sequence[int]) -> Tensor:
-        """(B, T) one in the last part of each sequence, where the answer is asked for."""
+    def _answer_mask(self, lengths: Sequence[int]) -> Tensor:
+        """(B, T) one in the last part of each sequence, where it is classified."""
         steps = torch.arange(max(lengths))
         ends = torch.tensor(lengths)[:, None]
         starts = (ends * (1 - self._config.answer_part)).floor()
@@ -129,12 +131,13 @@ class Pretraining:
 
 
 def soft_label(value: float, centres: Sequence[float]) -> NDArray[np.float32]:
-    """(classes,) all on the class whose centre `value` is, shared between two in between."""
+    """(classes,) one for the class with this centre; between two centres, shared by both."""
     shares = [np.interp(value, centres, only) for only in np.eye(len(centres))]
     return np.asarray(shares, np.float32)
 
 
-def _spread(values: Sequence[float], count: int) -> tuple[float, ...]:
+def _centres(values: Sequence[float], count: int) -> tuple[float, ...]:
+    """Centres of classes, evenly from the lowest to the highest value."""
     low, high = min(values), max(values)
     centres = np.linspace(low, max(high, low + 1e-6), count)  # centres must differ
     return tuple(centres.tolist())

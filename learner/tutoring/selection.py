@@ -8,6 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from learner.tutoring.store import TutoringStore
+from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 
@@ -23,18 +24,14 @@ class Intake:
         refused: why the others of the store cannot be learned from, by id.
     """
 
-    def __init__(
-        self, store: TutoringStore, image: tuple[int, int], values: Iterable[str] = ()
-    ) -> None:
+    def __init__(self, store: TutoringStore, values: Iterable[str] = ()) -> None:
         """Take in from `store`.
 
         Args:
             store: the sequences.
-            image: (width, height) that their pictures must have.
             values: names that their situations must have.
         """
         self._store = store
-        self._image = image
         self._values = tuple(values)
         self.taken: list[str] = []
         self.situations: set[frozenset[tuple[str, float]]] = set()
@@ -85,13 +82,12 @@ class Intake:
         return episodes
 
     def _check(self, episode: Episode) -> None:
-        width, height = self._image
         if episode.kind not in (Kind.TUTORING, Kind.CORRECTION):
             raise UserError(f"{episode.id} is a {episode.kind} episode, not a tutored one")
-        if episode.steps == 0 or episode.images.shape[1:] != (height, width):
+        if episode.steps == 0 or episode.images.shape[1:] != (IMAGE_HEIGHT, IMAGE_WIDTH):
             raise UserError(
-                f"{episode.id} has pictures {episode.images.shape}, not (steps, {height}, {width})"
-                " as network.image says"
+                f"{episode.id} has pictures {episode.images.shape}, not"
+                f" (steps, {IMAGE_HEIGHT}, {IMAGE_WIDTH})"
             )
         if not np.isfinite(episode.targets).all():
             raise UserError(f"{episode.id} has targets that are not finite numbers")

@@ -35,6 +35,7 @@ from services.figures.style import (
     percent,
     words_and_unit,
 )
+from services.terminal.rates import rate_text
 from services.trials.success import Rate
 from services.trials.trial_log import CountedTrial
 
@@ -236,7 +237,7 @@ def table(trials: Trials) -> Table:
     for name in trials.values:
         places = _places(trials, name)
         cells = [
-            _percent(trials.rate(reading, chosen))
+            rate_text(trials.rate(reading, chosen), digits=0)
             for reading in READINGS
             for chosen in places.values()
         ]
@@ -371,8 +372,3 @@ def _places(trials: Trials, name: str) -> dict[str, NDArray[np.bool_]]:
 
 def _rate_json(rate: Rate) -> dict[str, Any]:
     return rate.as_json() | {"trials": rate.trials}
-
-
-def _percent(rate: Rate) -> str:
-    low, high = rate.wilson95
-    return f"{100 * rate.rate:.0f} ({100 * low:.0f} to {100 * high:.0f})"
