@@ -9,9 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from actors.motion import execution_noise
 from actors.policies.contract import Policy
 from actors.tasks.contract import Situation
-from actors.tasks.experiment1.plan import execution_noise, plan
+from actors.tasks.experiment1.plan import plan
 from actors.tasks.experiment1.task import OBJECT_Y_M, OBJECT_YAW_DEG, OBSTACLE_X_M
 from learner.checkpoint import load_checkpoint
 from learner.network_policy import NetworkPolicy

@@ -7,7 +7,6 @@ give neighbouring trajectories. `actors.tasks.experiment1.fitting` found the coe
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -15,7 +14,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from actors.tasks.contract import Situation
 
@@ -75,12 +73,6 @@ class KeyPostures:
             "obstacle": {name: rows.round(4).tolist() for name, rows in self.obstacle.items()},
         }
         return json.dumps(values, indent=1) + "\n"
-
-
-def travel(postures: Sequence[Array], share: Array | float) -> Array:
-    """A smooth way through postures (each (7,)), evenly spaced over shares 0..1; (..., 7)."""
-    way = CubicSpline(np.linspace(0.0, 1.0, len(postures)), np.stack(postures))
-    return np.asarray(way(share))
 
 
 FITTED: Final = files("actors.tasks.experiment1").joinpath("postures.json")

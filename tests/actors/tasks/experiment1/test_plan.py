@@ -3,13 +3,12 @@
 import itertools
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.kinematics import Arm, Cuboid, Gaze
+from actors.kinematics import Arm, ClearanceBox, Gaze
 from actors.tasks.experiment1.fitting import PostureFitter
-from actors.tasks.experiment1.plan import execution_noise, plan
+from actors.tasks.experiment1.plan import plan
 from actors.tasks.experiment1.postures import load_key_postures
 from actors.tasks.experiment1.task import (
     OBSTACLE_SIZE_M,
@@ -44,7 +43,7 @@ def test_plan_stays_within_the_limits_and_moves_smoothly(situation):
 @settings(max_examples=25)
 def test_open_arm_passes_the_obstacle_closely_but_clear(situation):
     actions = plan(situation)
-    box = Cuboid(np.array(obstacle_pose(situation).position_m), np.array(OBSTACLE_SIZE_M))
+    box = ClearanceBox(np.array(obstacle_pose(situation).position_m), np.array(OBSTACLE_SIZE_M))
     approach = np.deg2rad(actions[actions[:, GRASP] <= 1.0][:, ARM])
     clearance = min(
         (box.distance(ARM_OPEN.pose(posture).points_m) - ARM_OPEN.radii_m).min()
@@ -93,14 +92,3 @@ def test_fitted_postures_are_those_that_lie_in_the_repository():
     for postures in ("object", "obstacle"):
         for name, rows in getattr(stored, postures).items():
             np.testing.assert_allclose(getattr(fitted, postures)[name], rows, atol=0.05)
-
-
-def test_noise_is_smooth_seeded_and_of_the_size_asked_for():
-    noise = np.concatenate([execution_noise(124, seed, 1.0, 20.0) for seed in range(200)])
-    late = noise.reshape(200, 124, 11)[:, 40:]
-    assert late[..., ARM].std() == pytest.approx(1.0, abs=0.1)
-    assert np.abs(np.diff(late, axis=1)).max() < 0.6
-    assert (noise[..., [GRASP, FOCUS]] == 0.0).all()
-    np.testing.assert_array_equal(execution_noise(50, 7, 1, 20), execution_noise(50, 7, 1, 20))
-    assert np.abs(execution_noise(50, 7, 1, 20) - execution_noise(50, 8, 1, 20)).max() > 0.1
-    assert (execution_noise(50, 7, 0.0, 20.0) == 0.0).all()
