@@ -99,6 +99,7 @@ class Learner:
             self._folder,
             self._materials[Stage.COUPLED].store,
             self._materials[Stage.PRETRAINING].store,
+            questions=tasks[config.pretraining_task or config.task.name].questions,
             rounds=config.learner.corrections.rounds,
         )
         self._training = threading.Lock()  # held while the trainer changes or is written to disk

@@ -42,19 +42,29 @@ class HubConfig(_Section):
     shared_memory: bool = False
 
 
-TaskName = Literal["experiment1", "reaching"]
-"""Experiment I, or the same without an obstacle, which the vision is pre-trained on."""
-
-
 Attention = Literal["active", "fixed"]
 """Whether the robot turns its head and focuses, or keeps both as they are at the start."""
 
 
 class TaskConfig(_Section):
-    """Which task is tutored and tested, and whether gaze and focus have a part in it."""
+    """Which task is tutored and tested, and whether gaze and focus have a part in it.
 
-    name: TaskName = "experiment1"
+    Attributes:
+        name: a task of `actors.tasks.registry`, or one's own as `package.module:Class`.
+        attention: whether the robot turns its head and focuses.
+
+    A task may have options of its own; it checks them itself, see `options`.
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    name: Annotated[str, Field(min_length=1, max_length=200)] = "experiment1"
     attention: Attention = "active"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What the section holds besides the keys above."""
+        return dict(self.model_extra or {})
 
 
 class SimulatorConfig(_Section):
@@ -156,23 +166,17 @@ class PretrainingConfig(_Section):
     On the bus the learner first asks the actors for the sequences of pre-training: each of `cases`
     (indices of the tutored cases of `task`, None for all) `repeats` times. It starts with
     `start_sequences` of them, or with all if they are fewer. Without a task of its own, and in
-    `vmdnn train` without --pretraining-data, the sequences of coupled training serve.
+    `vmdnn train` without --pretraining-data, the sequences of coupled training serve. What is asked
+    about them is the task's to say.
     """
 
-    task: Literal["reaching"] | None = "reaching"
+    task: Annotated[str, Field(min_length=1, max_length=200)] | None = None
     cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
     repeats: Count = 4
     start_sequences: Count = 60
     epochs: Annotated[int, Field(ge=0)] = 30
     rate: Positive = 2e-3
     batch: Count = 15
-    # values of the situation that are asked for, and in how many classes
-    labels: Annotated[dict[str, Annotated[int, Field(ge=2)]], Field(min_length=1)] = {
-        "object_y_m": 3,
-        "object_yaw_deg": 5,
-    }
-    # last part of a sequence in which the answer is asked for
-    answer_part: Annotated[float, Field(gt=0, le=1)] = 0.25
     # disturbance of the pictures, another one for each sequence and epoch: largest shift in pixels,
     # standard deviations of contrast and brightness, and of each pixel (brightness is -1..1)
     image_shift: Annotated[int, Field(ge=0)] = 3
@@ -339,10 +343,16 @@ class Config(_Section):
         return self.run.folder / self.run.name
 
     @property
-    def pretraining_task(self) -> TaskName | None:
+    def pretraining_task(self) -> str | None:
         """Task of the sequences of pre-training; None where those of coupled training serve."""
         first = self.learner.pretraining
         return None if first.epochs == 0 or first.task == self.task.name else first.task
+
+    def task_called(self, name: str) -> TaskConfig:
+        """The section `task` for another task, of which it knows no options."""
+        if name == self.task.name:
+            return self.task
+        return TaskConfig(name=name, attention=self.task.attention)
 
     @model_validator(mode="after")
     def _can_find_failures(self) -> Self:

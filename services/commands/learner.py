@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from actors.tasks.registry import TASKS
+from actors.tasks.registry import make_task
 from learner.learner import Learner
 from proto.bus import open_bus
 from proto.keys import Role
@@ -23,7 +23,8 @@ def run(arguments: argparse.Namespace) -> int:
     config = config_of(arguments)
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
-    tasks = {name: task() for name, task in TASKS.items()}
+    names = filter(None, (config.task.name, config.pretraining_task))
+    tasks = {name: make_task(config.task_called(name)) for name in names}
     process = arguments.id or "learner"
     with (
         only_one(config.run_folder, Role.LEARNER, "learner"),

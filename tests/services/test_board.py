@@ -14,7 +14,7 @@ from rich.console import Console
 
 from proto.bus import Bus, open_bus, open_hub
 from proto.config import HubConfig
-from proto.episode import Kind, Reason
+from proto.episode import Kind
 from proto.keys import Role
 from proto.membership import every
 from proto.metrics import (
@@ -34,7 +34,7 @@ from tests.ports import free_endpoint
 RUN = "watched"
 ACTOR = ActorMetrics(
     id="a-1", time_s=1.0, refused=0, policy_version=3, steps_per_s=81.25, episodes=17,
-    last_outcome=Reason.MOVED_OBJECT, last_kind=Kind.TRIAL, backend="sapien", outbox=2,
+    last_outcome="moved_object", last_kind=Kind.TRIAL, backend="sapien", outbox=2,
     paused=False,
 )  # fmt: skip
 LEARNER = LearnerMetrics(

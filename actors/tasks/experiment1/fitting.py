@@ -25,7 +25,6 @@ from actors.posture_fitting import (
     fit_polynomial,
     shortfall,
 )
-from actors.tasks.contract import Situation
 from actors.tasks.experiment1.postures import (
     FITTED,
     OBJECT_ORDERS,
@@ -34,7 +33,7 @@ from actors.tasks.experiment1.postures import (
     object_features,
     obstacle_features,
 )
-from actors.tasks.experiment1.task import (
+from actors.tasks.experiment1.world import (
     OBJECT_SIZE_M,
     OBSTACLE_SIZE_M,
     START,
@@ -43,6 +42,7 @@ from actors.tasks.experiment1.task import (
     obstacle_pose,
 )
 from proto.body import ARM
+from proto.variables import Situation, number_of
 from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
 
 Array = NDArray[np.float64]
@@ -270,7 +270,7 @@ class PostureFitter:
 
 def _object_box(situation: Situation) -> ClearanceBox:
     pose = object_pose(situation)
-    yaw = np.deg2rad(-situation["object_yaw_deg"])
+    yaw = np.deg2rad(-number_of(situation, "object_yaw_deg"))
     return ClearanceBox(np.array(pose.position_m), np.array(OBJECT_SIZE_M), float(yaw))
 
 
