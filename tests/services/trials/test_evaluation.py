@@ -15,9 +15,10 @@ from proto.config import Config, TaskConfig
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.recordings.episodes import read_episode
+from proto.variables import parse_situation
 from services.cli import main
 from services.playing.workers import play_all
-from services.trials.evaluation import parse_situation, trial_jobs
+from services.trials.evaluation import trial_jobs
 from services.trials.success import Tally, wilson95
 from services.trials.trial_log import read_trials
 
