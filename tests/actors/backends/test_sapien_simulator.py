@@ -164,21 +164,6 @@ def test_what_is_not_watched_is_not_reported(blind):
     assert blind.step(targets()).touches == frozenset()  # though the object stands on the table
 
 
-def test_fingers_feel_what_touches_them():
-    simulator = SapienSimulator(SimulatorConfig(render=False, control_period_s=0.005))
-    simulator.reset(scene(TABLE))
-    x, y, z = simulator.bodies()["r_middle_2"].position_m
-    crumb = Box("crumb", (0.02, 0.02, 0.02), Pose((x, y, z + 0.1)), (1, 1, 1), mass_kg=0.001)
-    simulator.reset(scene(TABLE, crumb))
-    assert not simulator.observe(Crop()).finger_contact
-    felt = []
-    for _ in range(60):
-        simulator.step(targets())
-        felt.append(simulator.observe(Crop()).finger_contact)
-    assert not felt[0]
-    assert any(felt)
-
-
 def rotation(quaternion):
     w, x, y, z = quaternion
     return np.array(

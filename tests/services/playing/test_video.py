@@ -93,7 +93,7 @@ def test_a_recovered_episode_can_be_seen(recordings: Path, tmp_path: Path) -> No
     ("arguments", "message"),
     [
         (["--out", "video.avi"], "must end in .mp4"),
-        (["--out", "video.mp4", "--backend", "nothing"], "no backend 'nothing'"),
+        (["--out", "video.mp4", "--backend", "nothing"], "there is no 'nothing'"),
     ],
 )
 def test_bad_input_says_what_to_do(
