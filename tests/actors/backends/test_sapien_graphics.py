@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from actors.backends.sapien import graphics
+from actors.backends import light
+from actors.backends.sapien import graphics, stage
 from actors.backends.sapien.probe import known_devices
 from actors.backends.sapien.simulator import SapienSimulator
 from actors.simulator import make_simulator
@@ -109,3 +113,36 @@ def test_its_driver_draws_in_the_calling_thread(monkeypatch):
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     )
     assert result.stdout == "0\n"
+
+
+def test_without_rendering_no_graphics_driver_is_needed():
+    program = (
+        "from actors.backends.sapien.simulator import SapienSimulator\n"
+        "from proto.config import SimulatorConfig\n"
+        "import numpy as np\n"
+        "from actors.simulator import Crop, JointTargets, Scene\n"
+        "start = JointTargets(np.zeros(2), np.full(7, 20.0), np.full(9, 20.0))\n"
+        "simulator = SapienSimulator(SimulatorConfig(render=False))\n"
+        "simulator.reset(Scene((), start, 0.15))\n"
+        "simulator.step(start)\n"
+        "simulator.observe(Crop())\n"
+        "print('played')\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "VK_ICD_FILENAMES": "/nonexistent.json"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.stdout == "played\n", result.stderr
+
+
+def test_the_shader_has_the_shared_light():
+    text = (Path(stage.__file__).parent / "shader" / "gbuffer.frag").read_text()
+    towards = re.search(r"const vec3 TO_SUN = vec3\((.*)\);", text)
+    numbers = dict(re.findall(r"const float (\w+) = (.*);", text))
+    assert tuple(map(float, towards[1].split(","))) == light.TO_SUN
+    assert {name: float(number) for name, number in numbers.items()} == {
+        "SUN": light.SUN, "SKY": light.SKY, "GROUND": light.GROUND, "GAMMA": light.GAMMA,
+    }  # fmt: skip
