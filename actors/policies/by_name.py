@@ -12,7 +12,7 @@ from learner.checkpoint import Checkpoint, load_checkpoint
 from learner.network_policy import NetworkPolicy
 from learner.pretrained import checkpoint_path, pretrained_names
 from proto.errors import UserError
-from proto.extensions import load_class
+from proto.extensions import check_attributes, load_class
 
 _METHODS: Final = ("begin", "step")
 _ATTRIBUTES: Final = ("name", "version", "looks", "target", "outputs")
@@ -62,11 +62,7 @@ def check_task(checkpoint: Checkpoint, task: str, origin: str) -> None:
 def _own(name: str) -> Policy:
     """A policy of the user's own; its attributes may be the class's or the object's."""
     policy: Policy = load_class("--policy", name, {}, _METHODS)()
-    if lacking := [each for each in _ATTRIBUTES if not hasattr(policy, each)]:
-        raise UserError(
-            f"--policy: {name!r} lacks the attributes {', '.join(lacking)}; see Policy in"
-            " actors/policies/contract.py"
-        )
+    check_attributes("--policy", name, policy, _ATTRIBUTES)
     return policy
 
 

@@ -7,15 +7,16 @@ from typing import Final
 
 from actors.tasks.contract import Task
 from proto.config import Config, TaskConfig
-from proto.extensions import load_class
+from proto.extensions import check_attributes, load_class
 
 TASKS: Final[Mapping[str, str]] = {
     "experiment1": "actors.tasks.experiment1.task:Experiment1",
     "reaching": "actors.tasks.experiment1.reaching:Reaching",
 }
-_NEEDED: Final = (
+_METHODS: Final = ("tutored", "sample", "check", "corners", "scene", "plan", "judge")
+_ATTRIBUTES: Final = (
     *("variables", "subtasks", "start", "questions", "baselines", "figure_words"),
-    *("tutored", "sample", "check", "corners", "scene", "plan", "judge", "phases", "phase_names"),
+    *("phases", "phase_names", "attention"),
 )
 
 
@@ -30,7 +31,8 @@ def make_task(config: TaskConfig) -> Task:
     Raises:
         UserError: there is no such task, its class lacks something, or an option is unknown.
     """
-    made = load_class("task.name", config.name, TASKS, _NEEDED)
+    made = load_class("task.name", config.name, TASKS, _METHODS)
     made.name = config.name  # recordings carry it, so that the task is found again
     task: Task = made(config)
+    check_attributes("task.name", config.name, task, _ATTRIBUTES)
     return task

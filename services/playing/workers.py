@@ -144,8 +144,7 @@ def _with_states(policy: Policy) -> StatefulPolicy:
 
 
 def _pool(workers: int, config: Config, policy: str) -> ProcessPoolExecutor:
-    for threads in ("OMP_NUM_THREADS", "LP_NUM_THREADS"):  # torch, and Mesa's software Vulkan
-        os.environ.setdefault(threads, "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch starts so many threads in each worker
     return ProcessPoolExecutor(
         workers,
         mp_context=multiprocessing.get_context("spawn"),

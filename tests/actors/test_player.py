@@ -87,7 +87,7 @@ def test_lifting_needs_friction(monkeypatch):
             boxes = tuple(dataclasses.replace(box, friction=0.02) for box in scene.boxes)
             return dataclasses.replace(scene, boxes=boxes)
 
-    monkeypatch.setattr("actors.backends.sapien.world.ROBOT_FRICTION", 0.02)
+    monkeypatch.setattr("actors.backends.robot.SKIN_FRICTION", 0.02)
     simulator = make_simulator(SimulatorConfig(render=False))
     policy = make_tutor(TASK)
     episode = play(
