@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 
 from actors.tasks.registry import TASKS
 from learner.learner import Learner
-from proto.bus import open_bus
 from proto.keys import Role
-from proto.membership import Lifecycle, only_one
-from services.arguments.common import add_process, config_of, start_logging
+from services.arguments.common import add_process
+from services.arguments.process import run_process
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -19,15 +19,5 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Learn until told to stop."""
-    start_logging("learner")
-    config = config_of(arguments)
-    lifecycle = Lifecycle()
-    lifecycle.stop_on_signals()
     tasks = {name: task() for name, task in TASKS.items()}
-    process = arguments.id or "learner"
-    with (
-        only_one(config.run_folder, Role.LEARNER, "learner"),
-        open_bus(config.hub, config.run.name, Role.LEARNER, process) as bus,
-    ):
-        Learner(config, bus, lifecycle, tasks=tasks).run()
-    return 0
+    return run_process(arguments, Role.LEARNER, partial(Learner, tasks=tasks))

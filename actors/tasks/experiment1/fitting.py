@@ -37,6 +37,7 @@ from actors.tasks.experiment1.task import (
     obstacle_pose,
 )
 from proto.body import ARM
+from proto.storage import written_whole
 from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
 
 Array = NDArray[np.float64]
@@ -340,8 +341,8 @@ def _obstacle_box(situation: Situation) -> Cuboid:
 def main() -> None:
     """Fit all key postures and write them where `load_key_postures` finds them."""
     text = PostureFitter().fit().to_json()
-    with as_file(FITTED) as path:
-        path.write_text(text)
+    with as_file(FITTED) as path, written_whole(path) as stream:
+        stream.write(text.encode())
     print(f"wrote {FITTED}")
 
 
