@@ -11,6 +11,7 @@ from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Table, Text, message
 from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind, Outcome
 from proto.keys import Role
+from proto.seeds import SEEDS_PER_CASE
 
 EPISODE_LIMIT: Final = 32 * MEBIBYTE
 POLICY_LIMIT: Final = 256 * MEBIBYTE
@@ -106,7 +107,7 @@ class TutoringCase:
     @property
     def seed(self) -> int:
         """Seed of the episode."""
-        return self.case * 1000 + self.repeat
+        return self.case * SEEDS_PER_CASE + self.repeat
 
 
 @message("correction", 1)
