@@ -26,7 +26,8 @@ from proto.codec import MessageError, encode
 from proto.config import Config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
-from proto.membership import Lifecycle, every, membership
+from proto.lifecycle import Lifecycle
+from proto.membership import membership
 from proto.messages import (
     Correction,
     Live,
@@ -42,6 +43,7 @@ from proto.messages import (
 from proto.metrics import ActorMetrics
 from proto.outbox import Outbox
 from proto.pace import Pace
+from proto.periodic import every
 from proto.seeds import PRACTICE
 from proto.variables import Situation
 

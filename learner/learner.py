@@ -25,7 +25,8 @@ from proto.bus import Bus, Inbox
 from proto.config import Config
 from proto.episode import Episode
 from proto.keys import Role
-from proto.membership import Lifecycle, alone_in_run, membership
+from proto.lifecycle import Lifecycle
+from proto.membership import alone_in_run, membership
 from proto.messages import (
     Correction,
     PolicyVersion,

@@ -10,6 +10,7 @@ from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Text, message
 from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind, Outcome
 from proto.keys import Role
+from proto.seeds import SEEDS_PER_CASE
 from proto.variables import SituationField
 
 EPISODE_LIMIT: Final = 32 * MEBIBYTE
@@ -105,7 +106,7 @@ class TutoringCase:
     @property
     def seed(self) -> int:
         """Seed of the episode."""
-        return self.case * 1000 + self.repeat
+        return self.case * SEEDS_PER_CASE + self.repeat
 
 
 @message("correction", 2)

@@ -17,7 +17,7 @@ from proto.config import Config
 from proto.errors import UserError
 from proto.storage import written_whole
 from proto.variables import parse_situation
-from services.arguments.common import add_config, add_playing, playing_config, positive
+from services.arguments.common import add_config, add_playing, playing_config, positive, seed
 from services.playing.video import write_video
 from services.playing.workers import Job, play_all
 from services.terminal.progress import progress_bar
@@ -39,7 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--trials", type=positive, default=52, help="how many situations")
     parser.add_argument(
-        "--seed", type=int, default=1000, help="the same seed gives the same situations"
+        "--seed", type=seed, default=1000, help="the same seed gives the same situations"
     )
     parser.add_argument(
         "--situation",

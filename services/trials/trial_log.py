@@ -24,6 +24,7 @@ from proto.episode import Episode, Id, Outcome
 from proto.errors import UserError
 from proto.messages import Count, Rollout
 from proto.recordings import format1
+from proto.storage import append_line, drop_unfinished_line
 from proto.variables import SituationField
 
 LOG = logging.getLogger(__name__)
@@ -126,25 +127,24 @@ class TrialLog:
     def __init__(self, path: Path) -> None:
         """Open a book, or begin it. A line that a killed process did not finish is dropped."""
         self._path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
         self._outcomes: dict[tuple[str, int], dict[int, Outcome]] = defaultdict(dict)
-        content = path.read_bytes() if path.exists() else b""
-        whole = content[: content.rfind(b"\n") + 1]
-        if whole != content:
+        if drop_unfinished_line(path):
             LOG.warning("%s: dropped its last line, which was not finished", path)
-            with path.open("r+b") as file:
-                file.truncate(len(whole))
-        for number, line in enumerate(whole.splitlines(), 1):
+        content = path.read_bytes() if path.exists() else b""
+        for number, line in enumerate(content.splitlines(), 1):
             self._read(line, number)
 
     def add(self, rollout: Rollout) -> bool:
-        """Count a trial; False if it was counted before."""
+        """Count a trial, on disk first; False if it was counted before.
+
+        Raises:
+            UserError: it cannot be written; then it is not counted.
+        """
         trial = CountedTrial.of(rollout.episode, rollout.run_id)
-        if not self._count(trial):
+        if trial.seed in self.outcomes(trial.run_id, trial.policy_version):
             return False
-        with self._path.open("ab") as file:
-            file.write(trial.line())
-        return True
+        append_line(self._path, trial.line())
+        return self._count(trial)
 
     def versions(self, run_id: str) -> list[int]:
         """Policy versions of a training that were tried, oldest first."""

@@ -42,6 +42,7 @@ from actors.tasks.experiment1.world import (
     obstacle_pose,
 )
 from proto.body import ARM
+from proto.storage import written_whole
 from proto.variables import Situation, number_of
 from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
 
@@ -281,8 +282,8 @@ def _obstacle_box(situation: Situation) -> ClearanceBox:
 def main() -> None:
     """Fit all key postures and write them where `load_key_postures` finds them."""
     text = PostureFitter().fit().to_json()
-    with as_file(FITTED) as path:
-        path.write_text(text)
+    with as_file(FITTED) as path, written_whole(path) as stream:
+        stream.write(text.encode())
     print(f"wrote {FITTED}")
 
 

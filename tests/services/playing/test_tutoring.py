@@ -7,11 +7,11 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import eventually
 
 from actors.tasks.registry import make_task
 from proto.config import TaskConfig
@@ -136,10 +136,9 @@ def test_ctrl_c_stops_cleanly(tmp_path: Path) -> None:
         text=True,
     )
     try:
-        deadline = time.monotonic() + 120
-        while not list(tmp_path.glob("*.mcap")) and process.poll() is None:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        eventually(
+            lambda: bool(list(tmp_path.glob("*.mcap"))) or process.poll() is not None, "a recording"
+        )
         os.killpg(process.pid, signal.SIGINT)
         _, errors = process.communicate(timeout=60)
     finally:
@@ -156,11 +155,13 @@ def test_ctrl_c_stops_cleanly(tmp_path: Path) -> None:
 
 
 def assert_gone(group: int) -> None:
-    """No process of the group is left, or it leaves right now."""
-    for _ in range(100):
+    """No process of the group is left, or the last one ends soon."""
+
+    def gone() -> bool:
         try:
             os.killpg(group, 0)
         except ProcessLookupError:
-            return
-        time.sleep(0.1)
-    raise AssertionError(f"processes of group {group} are still there")
+            return True
+        return False
+
+    eventually(gone, f"all processes of group {group} have ended")
