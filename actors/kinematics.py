@@ -30,8 +30,8 @@ _ROOT_IN_WORLD: Final = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 
 
 
 @dataclass(frozen=True)
-class Cuboid:
-    """A box that the arm must stay clear of, or may come close to.
+class ClearanceBox:
+    """A box whose distance to the arm is measured.
 
     Attributes:
         centre_m: (3,) centre in the world frame.

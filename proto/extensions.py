@@ -96,3 +96,15 @@ def _import_failed(option: str, name: str, error: Exception) -> UserError:
 def _missing(found: type[Any], required: Collection[str]) -> list[str]:
     abstract: Collection[str] = getattr(found, "__abstractmethods__", frozenset())
     return sorted(name for name in required if not hasattr(found, name) or name in abstract)
+
+
+def check_attributes(option: str, name: str, made: object, required: Collection[str]) -> None:
+    """Refuse an object of a user's class that lacks attributes which `load_class` cannot see.
+
+    Raises:
+        UserError: it does; the message lists them.
+    """
+    if missing := sorted(each for each in required if not hasattr(made, each)):
+        raise UserError(
+            f"{option}: {name!r} is incomplete; it lacks the attributes: {', '.join(missing)}."
+        )

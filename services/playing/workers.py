@@ -19,15 +19,16 @@ from itertools import islice
 from pathlib import Path
 
 from actors.player import play
-from actors.policies.by_name import make_policy, make_tutor
+from actors.policies.by_name import make_policy
 from actors.policies.contract import Policy, StatefulPolicy
+from actors.policies.planned import make_tutor
 from actors.simulator import Simulator, make_simulator
-from actors.tasks.contract import Situation
 from actors.tasks.registry import make_task
 from proto.config import Config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.recordings.episodes import write_episode
+from proto.variables import Situation
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,9 @@ class _Player:
     def _policy_for(self, job: Job) -> Policy:
         if job.noisy not in self._policies:
             self._policies[job.noisy] = (
-                make_tutor(self._config, noisy=True)
+                make_tutor(self._task, self._config.tutor)
                 if job.noisy
-                else make_policy(self._policy, self._config)
+                else make_policy(self._policy, self._task)
             )
         return self._policies[job.noisy]
 

@@ -6,11 +6,12 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from proto.errors import UserError
-from proto.extensions import load_class
+from proto.extensions import check_attributes, load_class
 
 BUILT_IN = {"plain": "collections:Counter", "other": "collections:OrderedDict"}
 
@@ -95,3 +96,8 @@ def test_an_incomplete_class_is_refused_with_what_it_lacks(folder: Path) -> None
     )
     with pytest.raises(UserError, match=re.escape("lacks: absent, inherited.")):
         load("half:Half", "given", "inherited", "absent")
+
+
+def test_an_object_without_its_attributes_is_refused() -> None:
+    with pytest.raises(UserError, match=r"'mine' is incomplete; it lacks the attributes: b, c\."):
+        check_attributes("task.name", "mine", SimpleNamespace(a=1), ("c", "a", "b"))
