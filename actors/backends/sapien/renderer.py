@@ -1,8 +1,8 @@
-"""Pictures of the world: a copy of its bodies that is moved to where they are when needed.
+"""Draws the world with SAPIEN: a copy of its bodies, moved to their poses before each picture.
 
-Rendering is kept apart from the physics, so that a machine without any graphics driver can still
-run scenes, and the same world can be drawn in two ways: quickly for the robot's eye, and with all
-details from outside.
+Rendering is separate from the physics for two reasons. A machine without a graphics driver can
+still run scenes. And the same world can be drawn in two ways: quickly for the robot's eye, and in
+full detail from outside.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from sim_assets.icub_visuals import Visual
 SHADER: Final = Path(__file__).parent / "shader"
 
 
-class Stage:
-    """Bodies made of shapes under a light that never changes (see `shader/`)."""
+class Renderer:
+    """The robot in one set of meshes, and boxes, in the light of `actors.backends.light`."""
 
     def __init__(self, robot: Iterable[Visual]) -> None:
         render.set_picture_format("Color", "r8g8b8a8unorm")  # a quarter of the usual floats
@@ -37,7 +37,7 @@ class Stage:
         self._cameras: dict[tuple[int, int], Any] = {}
 
     def set_boxes(self, boxes: Iterable[Box]) -> None:
-        """Replace the boxes by those of another scene."""
+        """Replace all boxes."""
         for entity in self._boxes.values():
             self._scene.remove_entity(entity)
         self._boxes = {box.name: self._add([_box_shape(box)]) for box in boxes}
