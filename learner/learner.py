@@ -18,6 +18,7 @@ from learner.training.training_run import (
     pretraining_is_over,
     write_policy,
 )
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.corrections import Round, Situations
 from learner.tutoring.curriculum import Curriculum
 from learner.tutoring.store import TutoringStore
@@ -96,11 +97,10 @@ class Learner:
         self._stores = _stores(config)
         self._materials = self._make_materials()
         self._trainer = open_training(
-            config,
+            VMDNNRecipe(config, tasks[config.pretraining_task or config.task.name].questions),
             self._folder,
             self._materials[Stage.COUPLED].store,
             self._materials[Stage.PRETRAINING].store,
-            questions=tasks[config.pretraining_task or config.task.name].questions,
             rounds=config.learner.corrections.rounds,
         )
         self._training = threading.Lock()  # held while the trainer changes or is written to disk
@@ -234,7 +234,7 @@ class Learner:
             self._round.shown(episode)
 
     def _make_round(self) -> Round | None:
-        """The round of corrections that the next epoch has to wait for, if it is a lap's first."""
+        """The round of corrections that the next epoch waits for, if it begins a round."""
         if not self._trainer.round_begins:
             return None
         newest = self._run_id, self._trainer.version
@@ -259,7 +259,7 @@ class Learner:
             if over:
                 self._trainer.save(pretraining_file(self._folder))
         self._pace.add()
-        if policy_is_due(self._trainer, self._config.learner):
+        if policy_is_due(self._trainer):
             with self._training:
                 write_policy(self._trainer, self._folder)
             # the training on disk knows of a version before anyone else does

@@ -190,7 +190,6 @@ class MapsConfig(_Section):
 class NetworkConfig(_Section):
     """VMDNN (paper, section 4.1)."""
 
-    image: tuple[Count, Count] = (64, 48)
     mstnn_fast: MapsConfig = MapsConfig(maps=3, kernel=(22, 14), stride=2, tau=2)
     mstnn_slow: MapsConfig = MapsConfig(maps=6, kernel=(8, 6), stride=2, tau=30)
     pfc: SubnetConfig = SubnetConfig(units=20, tau=150)

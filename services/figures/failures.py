@@ -35,6 +35,7 @@ from services.figures.style import (
     percent,
     words_and_unit,
 )
+from services.terminal.rates import rate_text
 from services.trials.success import Rate
 from services.trials.trial_log import CountedTrial
 
@@ -249,7 +250,7 @@ def table(trials: Trials) -> Table:
             continue
         places = _places(trials, name)
         cells = [
-            _percent(trials.rate(reading, chosen))
+            rate_text(trials.rate(reading, chosen), digits=0)
             for reading in READINGS
             for chosen in places.values()
         ]
@@ -262,7 +263,9 @@ def table(trials: Trials) -> Table:
 def _add_choices(result: Table, trials: Trials, axis: Axis) -> None:
     """Success for each choice of a discrete variable; nothing lies between them."""
     for each in _bins(axis):
-        strict, precise = (_percent(trials.rate(reading, each.chosen)) for reading in READINGS)
+        strict, precise = (
+            rate_text(trials.rate(reading, each.chosen), digits=0) for reading in READINGS
+        )
         result.add_row(f"{words_and_unit(axis.variable.name)[0]} {each.name}", strict, "", precise)
 
 
@@ -434,8 +437,3 @@ def _places(trials: Trials, name: str) -> dict[str, NDArray[np.bool_]]:
 
 def _rate_json(rate: Rate) -> dict[str, Any]:
     return rate.as_json() | {"trials": rate.trials}
-
-
-def _percent(rate: Rate) -> str:
-    low, high = rate.wilson95
-    return f"{100 * rate.rate:.0f} ({100 * low:.0f} to {100 * high:.0f})"

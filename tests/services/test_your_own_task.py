@@ -68,9 +68,8 @@ def test_its_recordings_carry_its_words(folder: Path) -> None:
     assert main(["replay", str(folder / "rollouts/trial0000.mcap"), "--out", "video.mp4"]) == 0
 
 
-def test_a_choice_is_written_on_the_command_line(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.usefixtures("folder")
+def test_a_choice_is_written_on_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     words = "evaluate --task touch:TouchBox --policy tutor --workers 1 --json --situation"
     assert main([*words.split(), "box_y_m=0.3,place=left"]) == 0
     assert json.loads(capsys.readouterr().out)["trials"] == 1
