@@ -50,6 +50,7 @@ class Reason(StrEnum):
     NEVER_CLOSED = "never_closed"
     NOT_LIFTED = "not_lifted"
     IMPRECISE = "imprecise"
+    SIMULATION_FAILED = "simulation_failed"
 
 
 @dataclass(frozen=True)
@@ -117,6 +118,8 @@ class Episode:
         control_period_s: time from one control step to the next (s).
         states: (T, units) float32 of each subnet by name, its activity, where that was asked for;
             else None.
+        training: id of the training that the policy comes from; empty for the tutor and for a
+            policy from a file.
     """
 
     id: Id
@@ -145,6 +148,7 @@ class Episode:
         States | None,
         Added(Table(Array("float32", (STEPS, Size("units", 1, 65536, own=True))), most=16)),
     ] = field(default=None)
+    training: Annotated[str, Text(64)] = ""
 
     @property
     def steps(self) -> int:

@@ -7,15 +7,31 @@ from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 from proto.codec import MessageError, Number, Table, Wire, decode, encode, message, schema_of
-from proto.episode import Episode, Id, Outcome
+from proto.episode import Episode, Id, Outcome, Reason
 from proto.errors import UserError
-from proto.messages import Count, Rollout
+from proto.messages import Count, EpisodeFailed, Rollout
 from proto.storage import append_line, drop_unfinished_line
 
 LOG = logging.getLogger(__name__)
+
+SIMULATION_FAILED: Final = Outcome(
+    lenient=False,
+    strict=False,
+    precise=False,
+    reason=Reason.SIMULATION_FAILED,
+    lifted_m=0.0,
+    moved_mm=0.0,
+    turned_deg=0.0,
+    yaw_error_deg=0.0,
+    along_mm=0.0,
+    across_mm=0.0,
+    closed_at=-1,
+    obstacle_touched_at=-1,
+)
+"""Outcome of a trial without a valid episode; its measures say nothing."""
 
 
 @message("counted_trial", 1, form="json")
@@ -100,11 +116,25 @@ class TrialLog:
         Raises:
             UserError: it cannot be written; then it is not counted.
         """
-        trial = CountedTrial.of(rollout.episode, rollout.run_id)
-        if trial.seed in self.outcomes(trial.run_id, trial.policy_version):
-            return False
-        append_line(self._path, trial.line())
-        return self._count(trial)
+        return self._add(CountedTrial.of(rollout.episode, rollout.run_id))
+
+    def add_failure(self, report: EpisodeFailed) -> bool:
+        """Count a trial whose simulation failed as a failure; False if it was counted before.
+
+        Raises:
+            UserError: it cannot be written; then it is not counted.
+        """
+        return self._add(
+            CountedTrial(
+                run_id=report.training,
+                policy_version=report.policy_version,
+                seed=report.seed,
+                episode=report.id,
+                actor=report.actor,
+                situation=report.situation,
+                outcome=SIMULATION_FAILED,
+            )
+        )
 
     def versions(self, run_id: str) -> list[int]:
         """Policy versions of a training that were tried, oldest first."""
@@ -114,6 +144,12 @@ class TrialLog:
     def outcomes(self, run_id: str, policy_version: int) -> Mapping[int, Outcome]:
         """Outcomes of a policy version by the trial's seed."""
         return dict(self._outcomes.get((run_id, policy_version), {}))
+
+    def _add(self, trial: CountedTrial) -> bool:
+        if trial.seed in self.outcomes(trial.run_id, trial.policy_version):
+            return False
+        append_line(self._path, trial.line())
+        return self._count(trial)
 
     def _count(self, trial: CountedTrial) -> bool:
         outcomes = self._outcomes[trial.run_id, trial.policy_version]

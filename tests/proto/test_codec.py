@@ -245,7 +245,7 @@ def test_without_its_check_a_mistake_is_refused_by_the_reader(sequence: Sequence
 
 def test_another_message_or_version_is_refused(sequence: Sequence) -> None:
     wire = encode(sequence)
-    assert wire.encoding == "application/msgpack;vmdnn.sequence.2"
+    assert wire.encoding == "application/msgpack;vmdnn.sequence.3"
     for encoding in (
         "application/msgpack;vmdnn.sequence.1",
         "application/msgpack;vmdnn.rollout.1",
