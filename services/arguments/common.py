@@ -6,7 +6,7 @@ import argparse
 import logging
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
@@ -120,20 +120,20 @@ def playing_config(arguments: argparse.Namespace, overrides: Sequence[str] = ())
     return load_config(arguments.config, [*arguments.overrides, *named, *overrides])
 
 
-def seed(text: str) -> int:
-    """A seed, for `type=` of an argument."""
-    return _integer(text, 0, LARGEST_SEED)
+def integer(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Make the `type=` of an argument that is an integer in least..most (None: unlimited)."""
+    limits = f"of at least {least}" if most is None else f"from {least} to {most}"
 
+    def number(text: str) -> int:
+        value = int(text) if re.fullmatch(r"[-+]?[0-9]{1,18}", text) else None
+        if value is None or value < least or (most is not None and value > most):
+            raise argparse.ArgumentTypeError(f"{text!r} is not an integer {limits}")
+        return value
 
-def positive(text: str) -> int:
-    """An integer of at least one, for `type=` of an argument."""
-    return _integer(text, 1, None)
-
-
-def _integer(text: str, least: int, most: int | None) -> int:
-    """Raises argparse.ArgumentTypeError if the text is no integer in least..most."""
-    number = int(text) if re.fullmatch(r"[-+]?[0-9]{1,18}", text) else None
-    if number is None or number < least or (most is not None and number > most):
-        limits = f"of at least {least}" if most is None else f"from {least} to {most}"
-        raise argparse.ArgumentTypeError(f"{text!r} is not an integer {limits}")
     return number
+
+
+seed = integer(0, LARGEST_SEED)
+"""`type=` of an argument that is a seed."""
+positive = integer(1)
+"""`type=` of an argument that is a number of things."""

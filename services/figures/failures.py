@@ -153,7 +153,10 @@ class Trials:
 
     def approached(self) -> NDArray[np.bool_]:
         """(N,) whether the hand closed while the object was still in its place."""
-        return np.array([self.words.in_place(outcome) for outcome in self.outcomes], dtype=np.bool_)
+        in_place = (
+            bool(outcome.measures) and self.words.in_place(outcome) for outcome in self.outcomes
+        )
+        return np.array(list(in_place), dtype=np.bool_)
 
     def reached(self) -> NDArray[np.bool_]:
         """(N,) whether in addition the hand was about where the object was."""
@@ -163,9 +166,13 @@ class Trials:
         return reached
 
     def error(self, error: GraspError) -> Array:
-        """(N,) an error at the grasp."""
+        """(N,) an error at the grasp; NaN where nothing was measured."""
         pairs = zip(self.outcomes, self.situations, strict=True)
-        return np.array([error.measure(outcome, situation) for outcome, situation in pairs])
+        errors = [
+            error.measure(outcome, situation) if outcome.measures else np.nan
+            for outcome, situation in pairs
+        ]
+        return np.array(errors, dtype=np.float64)
 
 
 @dataclass(frozen=True)
