@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 from actors.actor import Assignment, live_message
 from actors.attention import crop_of_focus, targets_of_action
 from actors.player import LiveStep, play
-from actors.policies.by_name import make_tutor
 from actors.policies.contract import Policy
+from actors.policies.planned import make_tutor
 from actors.simulator import Simulator, make_simulator
-from actors.tasks.contract import Situation, Task
-from actors.tasks.experiment1.plan import plan
+from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from learner.checkpoint import NETWORK_PREFIX, Checkpoint, CheckpointMetadata, CodeRanges
 from learner.network.numpy_network import NumpyNetwork, Parameters, make_acting_network
@@ -34,6 +33,7 @@ from proto.episode import Floats, Image, Kind
 from proto.machine import machine_name
 from proto.messages import Rollout
 from proto.metrics import Stage
+from proto.variables import Situation
 
 ROUNDS: Final = 7
 LIMIT_S: Final = 17.0
@@ -85,9 +85,9 @@ def bench_actor(config: Config) -> ActorSpeed:
     situation = task.tutored()[len(task.tutored()) // 2]
     with closing(make_simulator(config.simulator)) as simulator:
         theatre = _Theatre(simulator, task, situation)
-        tutor = make_tutor(config, noisy=False)
+        tutor = make_tutor(task)
         checkpoint = _random_checkpoint(config.network)
-        pupil = _Pupil(NetworkPolicy(checkpoint, "the benchmark"), plan(situation))
+        pupil = _Pupil(NetworkPolicy(checkpoint, "the benchmark"), task.plan(situation))
         others = _OtherNetworks(checkpoint)
         tutored = _Laps()
         theatre.play(tutor)  # warms up

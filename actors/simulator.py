@@ -10,16 +10,16 @@ teleported while a scene runs: what is lifted is lifted by friction.
 
 from __future__ import annotations
 
-import importlib
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from proto.config import SimulatorConfig
-from proto.errors import UserError
+from proto.extensions import load_class
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -134,12 +134,10 @@ class Observation:
     Attributes:
         image: (48, 64) uint8 grey picture of the crop asked for (V_I before normalization).
         joints_deg: (18,) measured angles: neck (2), arm (7), hand motors (9), in degrees.
-        finger_contact: whether any finger touches a moving box.
     """
 
     image: Image
     joints_deg: Array
-    finger_contact: bool
 
 
 @dataclass(frozen=True)
@@ -153,41 +151,101 @@ class StepReport:
     touches: frozenset[tuple[str, str]]
 
 
-class Simulator(Protocol):
-    """A simulator that can play scenes; made once, reset for each episode.
+OTHER_SYSTEM: Final = "other"
+"""In `Diagnosis.packages`, any system that is not named there."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Whether a backend can render on this machine.
 
     Attributes:
-        name: what it is called in the config and in recordings.
+        works: whether it can.
+        found: what was found, in one line: what renders, or what is wrong.
+        cure: what the user can do about it, in a few lines; empty if it works.
+        packages: arguments of `apt-get install` that provide the graphics driver, by system, such
+            as "debian-12" or "ubuntu-24.04" (ID and VERSION_ID of /etc/os-release), and for
+            OTHER_SYSTEM. Empty if it works, or if no package helps.
+    """
+
+    works: bool
+    found: str
+    cure: str = ""
+    packages: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def text(self) -> str:
+        """What was found and, if it does not work, what to do."""
+        return self.found if self.works else f"{self.found}.\n{self.cure}".rstrip()
+
+    def packages_for(self, system: str) -> tuple[str, ...]:
+        """The arguments of `apt-get install` for a system; empty where none are known."""
+        return self.packages.get(system, self.packages.get(OTHER_SYSTEM, ()))
+
+
+class Simulator(Protocol):
+    """A simulator that can play scenes; made once from a `SimulatorConfig`, reset for each episode.
+
+    With `SimulatorConfig.render` false it must run without any graphics driver, and every observed
+    image is black.
+
+    Attributes:
+        name: what it is called in the config and in recordings; `make_simulator` sets it.
         control_period_s: how long one control step lasts (s).
     """
 
     name: str
     control_period_s: float
 
+    @abstractmethod
+    def __init__(self, config: SimulatorConfig) -> None:
+        """Make it.
+
+        Raises:
+            UserError: it cannot run on this machine; the message says what to do.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def diagnose() -> Diagnosis:
+        """Try whether it can render on this machine; must return even where a driver crashes."""
+
+    @abstractmethod
     def reset(self, scene: Scene) -> None:
         """Replace whatever was there with `scene`; the same scene gives the same episode."""
 
+    @abstractmethod
     def step(self, targets: JointTargets) -> StepReport:
-        """Run one control period, moving the motors' targets linearly to `targets`."""
+        """Run one control period, moving the motors' targets linearly to `targets`.
 
+        Raises:
+            ValueError: a target is not a finite number.
+        """
+
+    @abstractmethod
     def observe(self, crop: Crop) -> Observation:
-        """Look through the left eye and feel the joints, now."""
+        """The network's picture of the left eye's crop, and the measured joints, now."""
 
+    @abstractmethod
     def joints_deg(self) -> Array:
         """Measured joint angles (18,) in degrees, without rendering."""
 
+    @abstractmethod
     def bodies(self) -> Bodies:
         """True pose of every box and of every moving link of the robot, by name."""
 
+    @abstractmethod
     def show(self, joints_deg: Array, boxes: Mapping[str, Pose]) -> None:
-        """Put a recorded state on the stage for pictures; not for use during an episode."""
+        """Put the robot and boxes into a recorded state, for pictures; not during an episode."""
 
+    @abstractmethod
     def eye_picture(self, crop: Crop, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the left eye's crop."""
 
+    @abstractmethod
     def outside_picture(self, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the scene from outside, full meshes."""
 
+    @abstractmethod
     def close(self) -> None:
         """Free what the simulator holds."""
 
@@ -195,25 +253,21 @@ class Simulator(Protocol):
 BACKENDS: Final[Mapping[str, str]] = {"sapien": "actors.backends.sapien.simulator:SapienSimulator"}
 
 
+def load_backend(name: str) -> type[Simulator]:
+    """The class of the backend that a name stands for: one of BACKENDS or `package.module:Class`.
+
+    Raises:
+        UserError: there is no such backend, or it lacks methods of `Simulator`.
+    """
+    return load_class("simulator.backend", name, BACKENDS, Simulator.__abstractmethods__)
+
+
 def make_simulator(config: SimulatorConfig) -> Simulator:
-    """Make the backend that `config.backend` names: one of BACKENDS or `package.module:Class`.
+    """Make the backend that `config.backend` names; that is its `name`, too.
 
     Raises:
         UserError: there is no such backend, or it cannot run on this machine.
     """
-    path = BACKENDS.get(config.backend, config.backend)
-    module_name, separator, class_name = path.partition(":")
-    if not separator:
-        raise UserError(
-            f"simulator.backend: there is no backend {config.backend!r}. There are: "
-            f"{', '.join(sorted(BACKENDS))}; a backend of your own is named package.module:Class."
-        )
-    try:
-        factory = getattr(importlib.import_module(module_name), class_name)
-    except (ImportError, AttributeError) as error:
-        raise UserError(
-            f"simulator.backend: {config.backend!r} cannot be loaded ({error}). "
-            f"Built in are: {', '.join(sorted(BACKENDS))}."
-        ) from error
-    simulator: Simulator = factory(config)
+    simulator = load_backend(config.backend)(config)
+    simulator.name = config.backend
     return simulator

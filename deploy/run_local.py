@@ -18,10 +18,13 @@ from proto.bus import Bus, open_bus
 from proto.config import Config, load_config
 from proto.errors import UserError
 from proto.keys import Role
-from proto.membership import METRICS_PERIOD_S, Lifecycle
+from proto.lifecycle import Lifecycle
+from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
-from services.board import Board, View, display, success_words
+from services.board import Board, RunView
 from services.machine.ports import port_trouble
+from services.terminal.display import display
+from services.terminal.run_words import success_words
 
 DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
 VMDNN: Final = str(Path(sys.executable).with_name("vmdnn"))
@@ -122,7 +125,7 @@ def programs(config: Config, file: Path, actors: int) -> list[Program]:
     return started
 
 
-def is_done(view: View) -> bool:
+def is_done(view: RunView) -> bool:
     """Whether learner and evaluator say that they have reached what the config's `done` asks."""
     learners = view.living(LearnerMetrics)
     evaluators = view.living(EvaluatorMetrics)
@@ -162,7 +165,7 @@ class Crashes:
         return back
 
 
-def summary(view: View, config: Config, wall_s: float) -> str:
+def summary(view: RunView, config: Config, wall_s: float) -> str:
     """How a run went, in a few lines."""
     minutes, seconds = divmod(round(wall_s), 60)
     lines = [
@@ -175,7 +178,9 @@ def summary(view: View, config: Config, wall_s: float) -> str:
     return "\n".join(lines)
 
 
-def _follow(board: Board, supervisor: Supervisor, lifecycle: Lifecycle, console: Console) -> View:
+def _follow(
+    board: Board, supervisor: Supervisor, lifecycle: Lifecycle, console: Console
+) -> RunView:
     """Show what happens until the run is done or should stop; the last view."""
     crashes = Crashes()
     with display(console) as show:

@@ -18,6 +18,7 @@ from xmlrpc.client import ServerProxy
 from supervisor.xmlrpc import SupervisorTransport
 
 from proto.errors import UserError
+from proto.storage import written_whole
 
 START_WITHIN_S: Final = 20.0
 BAD_INPUT: Final = 2
@@ -90,12 +91,12 @@ class Supervisor:
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
-        self._folder.mkdir(parents=True, exist_ok=True)
         # A socket's path may have 107 characters at most, so it cannot lie in the run's folder.
         self._socket_folder = tempfile.TemporaryDirectory(prefix="vmdnn-")
         socket = Path(self._socket_folder.name) / "socket"
         config = self._folder / "supervisord.conf"
-        config.write_text(supervisord_config(self.programs, self._folder, socket))
+        with written_whole(config) as stream:
+            stream.write(supervisord_config(self.programs, self._folder, socket).encode())
         self._socket = socket
         self._process = subprocess.Popen(
             (*_DIES_WITH_PARENT, sys.executable, "-m", "supervisor.supervisord", "-c", config),
@@ -206,7 +207,7 @@ process_name={name}
 numprocs={program.processes}
 numprocs_start=1
 priority={rank}
-environment=OMP_NUM_THREADS="{program.threads}",LP_NUM_THREADS="{program.threads}"
+environment=OMP_NUM_THREADS="{program.threads}"
 autostart=false
 autorestart=unexpected
 exitcodes=0,{BAD_INPUT}

@@ -35,6 +35,10 @@ NETWORK_PREFIX: Final = "network."
 CLASSIFIER_PREFIX: Final = "classifier."
 
 
+Classes = tuple[float, ...] | tuple[str, ...]
+"""The classes of a variable: centres of a continuous one, choices of a discrete one."""
+
+
 class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -51,11 +55,14 @@ class TrainingMetadata(_Model):
 
     Attributes:
         sequences: ids of the tutored sequences, in the order in which they were taken.
-        classes: centres of the classes of pre-training, by name of the situation's value.
+        classes: classes of pre-training by name of the variable: centres of a continuous one,
+            choices of a discrete one.
+        windows: in which part of a sequence each is asked for, see `proto.variables.Question`.
     """
 
     sequences: tuple[str, ...]
-    classes: dict[str, tuple[float, ...]]
+    classes: dict[str, Classes]
+    windows: dict[str, tuple[float, float]] = {}
 
 
 class RivalMetadata(_Model):
@@ -74,13 +81,15 @@ class CheckpointMetadata(_Model):
     """What a checkpoint says about itself.
 
     Attributes:
-        format: version of this format.
+        format: version of this format. Format 1 did not name task and simulator.
         run: name of the run.
         version: policy version; 0 before the first policy.
         stage: stage of the training.
         epoch: epochs of that stage that are done.
         loss: loss of the last of them, or None.
         config_digest: digest of the effective configuration.
+        task: task that it was trained for; None where format 1 did not say.
+        backend: simulator whose pictures it was trained on; None where format 1 did not say.
         network: the network; of a rival only its pictures and outputs.
         code: ranges of the outputs; None as long as the network cannot act.
         cases: different situations that this stage has learned from; 0 if that was not counted.
@@ -89,13 +98,15 @@ class CheckpointMetadata(_Model):
         rival: None for VMDNN.
     """
 
-    format: Literal[1] = 1
+    format: Literal[1, 2] = 2
     run: str
     version: int
     stage: Stage
     epoch: int
     loss: float | None
     config_digest: str
+    task: str | None = None
+    backend: str | None = None
     network: NetworkConfig
     code: CodeRanges | None
     cases: int = 0

@@ -25,7 +25,8 @@ from proto.bus import Bus, Inbox
 from proto.config import Config
 from proto.episode import Episode
 from proto.keys import Role
-from proto.membership import Lifecycle, alone_in_run, membership
+from proto.lifecycle import Lifecycle
+from proto.membership import alone_in_run, membership
 from proto.messages import (
     Correction,
     PolicyVersion,
@@ -99,6 +100,7 @@ class Learner:
             self._folder,
             self._materials[Stage.COUPLED].store,
             self._materials[Stage.PRETRAINING].store,
+            questions=tasks[config.pretraining_task or config.task.name].questions,
             rounds=config.learner.corrections.rounds,
         )
         self._training = threading.Lock()  # held while the trainer changes or is written to disk

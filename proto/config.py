@@ -5,32 +5,84 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import ErrorDetails
 
 from proto.errors import UserError
-from proto.seeds import TRIALS_BELOW
+from proto.seeds import SEEDS_PER_CASE, TRIALS_BELOW
 from proto.storage import written_whole
+from proto.strict_yaml import WrittenFloat, WrittenInt, load_yaml
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
+# Strict: a text or a truth value is never taken for a number.
+Switch = Annotated[bool, Field(strict=True)]
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+TimeConstant = Annotated[float, Field(strict=True, ge=1)]
+Natural = Annotated[int, Field(strict=True, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+AtLeastTwo = Annotated[int, Field(strict=True, ge=2)]
+
+
+def _check_repeats(repeats: int) -> int:
+    if repeats > SEEDS_PER_CASE:
+        raise ValueError(
+            f"must not exceed {SEEDS_PER_CASE}: a case has so many seeds, one for each repeat"
+        )
+    return repeats
+
+
+Repeats = Annotated[Count, AfterValidator(_check_repeats)]
+
+
+def _expand_home(folder: Path) -> Path:
+    try:
+        return folder.expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"~ cannot be expanded: {error}") from error
 
 
 class _Section(BaseModel):
+    """A part of the configuration; in YAML an empty section means all defaults."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_written(cls, values: Any) -> Any:
+        """Accept an empty section, and numbers as texts, such as `name: 007`, as they stand."""
+        if values is None:
+            return {}
+        if not isinstance(values, dict):
+            return values
+        texts = {
+            name for name, field in cls.model_fields.items() if field.annotation in (str, Path)
+        }
+        return {
+            name: value.text
+            if name in texts and isinstance(value, WrittenInt | WrittenFloat)
+            else value
+            for name, value in values.items()
+        }
 
 
 class RunConfig(_Section):
     """The run: a folder with its config, checkpoints, tutoring, rollouts, evaluation and logs."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = "experiment1"
-    folder: Path = Path("runs")
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    folder: Annotated[Path, AfterValidator(_expand_home)] = Path("runs")
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 1
 
 
 class HubConfig(_Section):
@@ -39,11 +91,11 @@ class HubConfig(_Section):
     endpoint: Annotated[str, Field(pattern=r"^(tcp|tls|udp|quic|ws)/.+:\d+$")] = (
         "tcp/127.0.0.1:7447"
     )
-    shared_memory: bool = False
+    shared_memory: Switch = False
 
 
-TaskName = Literal["experiment1", "reaching"]
-"""Experiment I, or the same without an obstacle, which the vision is pre-trained on."""
+TaskName = Annotated[str, Field(min_length=1, max_length=200)]
+"""A built-in task, or one of the user's own as `package.module:Class`."""
 
 
 Attention = Literal["active", "fixed"]
@@ -51,10 +103,24 @@ Attention = Literal["active", "fixed"]
 
 
 class TaskConfig(_Section):
-    """Which task is tutored and tested, and whether gaze and focus have a part in it."""
+    """Which task is tutored and tested, and whether gaze and focus have a part in it.
+
+    Attributes:
+        name: a task of `actors.tasks.registry`, or one's own as `package.module:Class`.
+        attention: whether the robot turns its head and focuses.
+
+    A task may have options of its own; it checks them itself, see `options`.
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
 
     name: TaskName = "experiment1"
     attention: Attention = "active"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What the section holds besides the keys above."""
+        return dict(self.model_extra or {})
 
 
 class SimulatorConfig(_Section):
@@ -63,7 +129,7 @@ class SimulatorConfig(_Section):
     backend: str = "sapien"
     control_period_s: Positive = 0.1
     physics_period_s: Positive = 0.005
-    render: bool = True
+    render: Switch = True
 
     @property
     def substeps(self) -> int:
@@ -85,8 +151,8 @@ class ActorConfig(_Section):
         live: publish each step while anyone watches.
     """
 
-    practice: bool = True
-    live: bool = True
+    practice: Switch = True
+    live: Switch = True
 
 
 class TutorConfig(_Section):
@@ -99,7 +165,7 @@ class TutorConfig(_Section):
         guidance_deg: in a correction, how far neck and arm may be told to be from the clean plan.
     """
 
-    repeats: Count = 4
+    repeats: Repeats = 4
     noise_deg: NotNegative = 1.0
     noise_correlation_steps: Positive = 20.0
     guidance_deg: NotNegative = 5.0
@@ -109,7 +175,7 @@ class SubnetConfig(_Section):
     """A subnet of leaky integrators without space (PFC, M_S, M_F)."""
 
     units: Count
-    tau: Annotated[float, Field(ge=1)]
+    tau: TimeConstant
 
 
 class MapsConfig(_Section):
@@ -118,7 +184,7 @@ class MapsConfig(_Section):
     maps: Count
     kernel: tuple[Count, Count]
     stride: Count
-    tau: Annotated[float, Field(ge=1)]
+    tau: TimeConstant
 
 
 class NetworkConfig(_Section):
@@ -130,18 +196,18 @@ class NetworkConfig(_Section):
     pfc: SubnetConfig = SubnetConfig(units=20, tau=150)
     mtrnn_slow: SubnetConfig = SubnetConfig(units=30, tau=10)
     mtrnn_fast: SubnetConfig = SubnetConfig(units=50, tau=2)
-    softmax_units: Annotated[int, Field(ge=2)] = 10
+    softmax_units: AtLeastTwo = 10
     code_margin: NotNegative = 0.2
     code_width: Positive = 0.6
     update_order: Literal["bottom_up", "literal"] = "bottom_up"
 
     @model_validator(mode="before")
     @classmethod
-    def _rest_is_the_papers(cls, values: Any) -> Any:
-        """Let a config name only what differs, such as `pfc: {tau: 30}`."""
+    def _complete_subnets(cls, values: Any) -> Any:
+        """Take what is not given of a subnet from the paper: `pfc: {tau: 30}` gives no units."""
         if not isinstance(values, dict):
             return values
-        given = {name: value for name, value in values.items() if isinstance(value, dict)}
+        given = {n: value or {} for n, value in values.items() if isinstance(value, dict | None)}
         defaults = {
             name: field.default.model_dump()
             for name, field in cls.model_fields.items()
@@ -156,26 +222,20 @@ class PretrainingConfig(_Section):
     On the bus the learner first asks the actors for the sequences of pre-training: each of `cases`
     (indices of the tutored cases of `task`, None for all) `repeats` times. It starts with
     `start_sequences` of them, or with all if they are fewer. Without a task of its own, and in
-    `vmdnn train` without --pretraining-data, the sequences of coupled training serve.
+    `vmdnn train` without --pretraining-data, the sequences of coupled training serve. What is asked
+    about them is the task's to say.
     """
 
-    task: Literal["reaching"] | None = "reaching"
-    cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
-    repeats: Count = 4
+    task: TaskName | None = None
+    cases: tuple[Natural, ...] | None = None
+    repeats: Repeats = 4
     start_sequences: Count = 60
-    epochs: Annotated[int, Field(ge=0)] = 30
+    epochs: Natural = 30
     rate: Positive = 2e-3
     batch: Count = 15
-    # values of the situation that are asked for, and in how many classes
-    labels: Annotated[dict[str, Annotated[int, Field(ge=2)]], Field(min_length=1)] = {
-        "object_y_m": 3,
-        "object_yaw_deg": 5,
-    }
-    # last part of a sequence in which the answer is asked for
-    answer_part: Annotated[float, Field(gt=0, le=1)] = 0.25
     # disturbance of the pictures, another one for each sequence and epoch: largest shift in pixels,
     # standard deviations of contrast and brightness, and of each pixel (brightness is -1..1)
-    image_shift: Annotated[int, Field(ge=0)] = 3
+    image_shift: Natural = 3
     image_gain: NotNegative = 0.05
     image_noise: NotNegative = 0.03
 
@@ -196,7 +256,7 @@ class CorrectionsConfig(_Section):
         epochs: epochs after each round.
     """
 
-    rounds: Annotated[int, Field(ge=0)] = 0
+    rounds: Natural = 0
     choose: Literal["failures", "random", "tutored"] = "failures"
     sequences: Count = 45
     tries: Count = 200
@@ -213,13 +273,13 @@ class LearnerConfig(_Section):
     the rounds of `corrections`, each with a policy at its end.
     """
 
-    cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    cases: tuple[Natural, ...] | None = None
     lease_s: Positive = 60.0
     start_sequences: Count = 45
     epochs: Count = 400
     rate: Positive = 3e-3
     schedule: Literal["constant", "cosine"] = "cosine"
-    warmup_epochs: Annotated[int, Field(ge=0)] = 12
+    warmup_epochs: Natural = 12
     batch: Count = 30
     clip_norm: Positive | None = 1.0
     # in coupled training: disturbance of each unit of V_S, another one for each sequence and epoch,
@@ -227,7 +287,7 @@ class LearnerConfig(_Section):
     vision_noise: NotNegative = 0.3
     # share of the sequences in whose place one between tutored situations is learned, guessed from
     # the sequences around it
-    interpolation: Annotated[float, Field(ge=0, le=1)] = 0.7
+    interpolation: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.7
     initial_range: Positive = 0.1
     initial_range_pfc_input: Positive = 0.2
     checkpoint_every_epochs: Count = 50
@@ -261,7 +321,7 @@ class RivalConfig(_Section):
     together_epochs: Count = 60
     epochs: Count = 600
     rate: Positive = 3e-3
-    image_shift: Annotated[int, Field(ge=0)] = 2
+    image_shift: Natural = 2
     image_gain: NotNegative = 0.05
     image_noise: NotNegative = 0.03
 
@@ -288,16 +348,16 @@ class ComparisonConfig(_Section):
 class EvaluatorConfig(_Section):
     """Trials of unlearned situations, counted for each policy version."""
 
-    trials_per_policy: Annotated[int, Field(ge=1, le=2**28)] = 52
+    trials_per_policy: Annotated[int, Field(strict=True, ge=1, le=2**28)] = 52
     # the last trial's seed is so below all those that may be tutored
-    seed: Annotated[int, Field(ge=0, le=TRIALS_BELOW - 2**28)] = 1000
+    seed: Annotated[int, Field(strict=True, ge=0, le=TRIALS_BELOW - 2**28)] = 1000
     lease_s: Positive = 60.0
 
 
 class RecorderConfig(_Section):
     """What is kept of the rollouts on disk: all of them, or only those that are trials."""
 
-    practice: bool = True
+    practice: Switch = True
 
 
 class DoneConfig(_Section):
@@ -339,10 +399,16 @@ class Config(_Section):
         return self.run.folder / self.run.name
 
     @property
-    def pretraining_task(self) -> TaskName | None:
+    def pretraining_task(self) -> str | None:
         """Task of the sequences of pre-training; None where those of coupled training serve."""
         first = self.learner.pretraining
         return None if first.epochs == 0 or first.task == self.task.name else first.task
+
+    def task_called(self, name: str) -> TaskConfig:
+        """The section `task` for another task, of which it knows no options."""
+        if name == self.task.name:
+            return self.task
+        return TaskConfig(name=name, attention=self.task.attention)
 
     @model_validator(mode="after")
     def _can_find_failures(self) -> Self:
@@ -382,16 +448,7 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     Raises:
         UserError: missing file, broken YAML, unknown key, wrong type or value out of range.
     """
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            values = yaml.safe_load(path.read_text()) or {}
-        except FileNotFoundError as error:
-            raise UserError(f"config file {path} does not exist") from error
-        except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-            raise UserError(f"config file {path} cannot be read: {error}") from error
-        if not isinstance(values, dict):
-            raise UserError(f"config file {path}: expected `section: ...` lines at the top level")
+    values = {} if path is None else _read(path)
     for override in overrides:
         _apply(values, override)
     try:
@@ -399,16 +456,46 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     except ValidationError as error:
         where = f"config file {path}" if path else "config"
         problems = "\n".join(
-            f"  {'.'.join(str(part) for part in problem['loc'])}: {_what_is_wrong(problem)}"
-            for problem in error.errors()
+            f"  {_key_of(problem)}: {_what_is_wrong(problem)}" for problem in error.errors()
         )
         raise UserError(f"{where} is not valid:\n{problems}") from error
 
 
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values = load_yaml(path.read_text())
+    except FileNotFoundError as error:
+        raise UserError(f"config file {path} does not exist") from error
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise UserError(f"config file {path} cannot be read: {error}") from error
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise UserError(f"config file {path}: expected `section: ...` lines at the top level")
+    return values
+
+
+def _key_of(problem: ErrorDetails) -> str:
+    return ".".join(str(part) for part in problem["loc"])
+
+
 def _what_is_wrong(problem: ErrorDetails) -> str:
     if problem["type"] == "extra_forbidden":
-        return "there is no such key; proto/config.py lists those there are"
-    return f"{problem['msg']} (got {problem['input']!r})"
+        similar = get_close_matches(_key_of(problem), _keys_of(Config), n=1)
+        advice = f"did you mean {similar[0]}?" if similar else "proto/config.py lists all keys"
+        return f"there is no such key; {advice}"
+    return f"{problem['msg'].removeprefix('Value error, ')} (got {problem['input']!r})"
+
+
+def _keys_of(section: type[BaseModel], prefix: str = "") -> list[str]:
+    """All keys of a section, such as `learner` and `learner.rate`."""
+    keys = []
+    for name, field in section.model_fields.items():
+        keys.append(f"{prefix}{name}")
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            keys += _keys_of(kind, f"{prefix}{name}.")
+    return keys
 
 
 def _apply(values: dict[str, Any], override: str) -> None:
@@ -417,11 +504,12 @@ def _apply(values: dict[str, Any], override: str) -> None:
         raise UserError(f"--set {override!r}: expected key=value, such as learner.rate=1e-3")
     *sections, last = key.split(".")
     for section in sections:
-        inner = values.setdefault(section, {})
-        if not isinstance(inner, dict):
+        if values.get(section) is None:
+            values[section] = {}
+        if not isinstance(values[section], dict):
             raise UserError(f"--set {override!r}: {section} is a value, not a section")
-        values = inner
+        values = values[section]
     try:
-        values[last] = yaml.safe_load(text)
+        values[last] = load_yaml(text)
     except yaml.YAMLError as error:
-        raise UserError(f"--set {override!r}: {text!r} is not a YAML value") from error
+        raise UserError(f"--set {override!r}: {text!r} is not a YAML value: {error}") from error

@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Role(StrEnum):
-    """What a process is."""
+    """What a process does in a run."""
 
     HUB = "hub"
     ACTOR = "actor"
@@ -15,6 +15,11 @@ class Role(StrEnum):
     EVALUATOR = "evaluator"
     RECORDER = "recorder"
     WATCH = "watch"
+
+    @property
+    def with_article(self) -> str:
+        """Such as `an actor`, for messages to users."""
+        return f"an {self}" if self[0] in "ae" else f"a {self}"
 
 
 ANYONE = "*"

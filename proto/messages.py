@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Final
 
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
-from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Table, Text, message
+from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Text, message
 from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind, Outcome
 from proto.keys import Role
+from proto.seeds import SEEDS_PER_CASE
+from proto.variables import SituationField
 
 EPISODE_LIMIT: Final = 32 * MEBIBYTE
 POLICY_LIMIT: Final = 256 * MEBIBYTE
 
 Count = Annotated[int, Integer(0, 2**31)]
 Seed = Annotated[int, Integer(0, 2**63 - 1)]
-Values = Annotated[Mapping[str, float], Table(Number(), most=32)]
 
 
 @message("policy", 1, limit=POLICY_LIMIT + MEBIBYTE)
@@ -42,7 +42,7 @@ class PolicyVersion:
     weights: Annotated[bytes, Blob(POLICY_LIMIT)]
 
 
-@message("sequence", 2, limit=EPISODE_LIMIT)
+@message("sequence", 3, limit=EPISODE_LIMIT)
 @dataclass(frozen=True)
 class Sequence:
     """A tutored episode or a correction, for the learner."""
@@ -50,7 +50,7 @@ class Sequence:
     episode: Episode
 
 
-@message("rollout", 1, limit=EPISODE_LIMIT)
+@message("rollout", 2, limit=EPISODE_LIMIT)
 @dataclass(frozen=True)
 class Rollout:
     """An episode that a network played, as a trial or for practice, for the evaluator.
@@ -106,10 +106,10 @@ class TutoringCase:
     @property
     def seed(self) -> int:
         """Seed of the episode."""
-        return self.case * 1000 + self.repeat
+        return self.case * SEEDS_PER_CASE + self.repeat
 
 
-@message("correction", 1)
+@message("correction", 2)
 @dataclass(frozen=True)
 class Correction:
     """A situation in which the policy of the request is to act while the tutor guides it.
@@ -122,10 +122,10 @@ class Correction:
 
     task: Annotated[str, Text(64)]
     seed: Seed
-    situation: Values
+    situation: SituationField
 
 
-@message("verdict", 1)
+@message("verdict", 2)
 @dataclass(frozen=True)
 class Verdict:
     """How an episode of practice ended; it tells the learner where tutoring is needed.
@@ -143,7 +143,7 @@ class Verdict:
     policy_version: Count
     task: Annotated[str, Text(64)]
     seed: Seed
-    situation: Values
+    situation: SituationField
     outcome: Outcome
 
 
@@ -169,7 +169,7 @@ class Trial:
     seed: Seed
 
 
-@message("live", 2)
+@message("live", 3)
 @dataclass(frozen=True)
 class Live:
     """One control step as it happens.
@@ -180,7 +180,7 @@ class Live:
         policy: name of the policy.
         policy_version: its version.
         step: control step, from 0.
-        phase: subtask of the paper, 1..8.
+        phase: name of the phase.
         image: (48, 64) uint8, the network's grey picture.
         joints_deg: (18,) float32, neck, arm and hand as measured.
         action: (11,) float32, what the robot is told.
@@ -191,7 +191,7 @@ class Live:
     policy: str
     policy_version: Count
     step: Count
-    phase: Annotated[int, Integer(1, 8)]
+    phase: Annotated[str, Text(64)]
     image: Annotated[Image, Array("uint8", (IMAGE_HEIGHT, IMAGE_WIDTH))]
     joints_deg: Annotated[Floats, Array("float32", (JOINTS,), -LARGEST_DEG, LARGEST_DEG)]
     action: Annotated[Floats, Array("float32", (ACTION_SIZE,), -LARGEST_DEG, LARGEST_DEG)]

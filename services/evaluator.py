@@ -12,7 +12,8 @@ from proto.config import Config
 from proto.episode import Episode, Kind, Outcome
 from proto.keys import Role
 from proto.leases import Leases
-from proto.membership import Lifecycle, alone_in_run, membership
+from proto.lifecycle import Lifecycle
+from proto.membership import alone_in_run, membership
 from proto.messages import PolicyVersion, Receipt, Rollout, Trial, TrialRequest, Verdict
 from proto.metrics import EvaluatorMetrics, PolicyScore, Success
 from services.trials.success import Tally
@@ -24,7 +25,7 @@ WAITING: Final = 64
 """Rollouts that may wait to be counted; more are dropped, and sent again by their actors."""
 IDLE_S: Final = 0.5
 
-Policy = tuple[str, int]
+PolicyKey = tuple[str, int]
 """A policy's training and version."""
 
 
@@ -37,10 +38,10 @@ class Evaluator:
         self._bus = bus
         self._lifecycle = lifecycle
         self._book = TrialLog(config.run_folder / "evaluation" / "trials.jsonl")
-        self._leases: Leases[tuple[Policy, int]] = Leases(config.evaluator.lease_s)
+        self._leases: Leases[tuple[PolicyKey, int]] = Leases(config.evaluator.lease_s)
         first = config.evaluator.seed
         self._seeds = range(first, first + config.evaluator.trials_per_policy)
-        self._newest: Policy = ("", 0)
+        self._newest: PolicyKey = ("", 0)
 
     def run(self) -> None:
         """Evaluate until it should stop.
@@ -136,7 +137,7 @@ class Evaluator:
     def _is(self, kind: Kind, episode: Episode) -> bool:
         return episode.kind is kind and episode.task == self._config.task.name
 
-    def _counted(self, policy: Policy) -> Mapping[int, Outcome]:
+    def _counted(self, policy: PolicyKey) -> Mapping[int, Outcome]:
         outcomes = self._book.outcomes(*policy)
         return {seed: outcome for seed, outcome in outcomes.items() if seed in self._seeds}
 

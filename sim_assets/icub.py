@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import shutil
 import tempfile
 import xml.etree.ElementTree as ET
@@ -128,17 +127,19 @@ class IcubModel:
     seen_from_outside: tuple[Visual, ...]
 
 
-def build_icub(cache: Path | None = None) -> IcubModel:
-    """Build the robot, or find it in the cache folder.
+def build_icub(cache: Path) -> IcubModel:
+    """Build the robot in the folder `cache`, or find it there.
 
-    The folder is `cache`, else the environment variable VMDNN_CACHE, else `~/.cache/vmdnn`. Many
-    processes may build at once: each builds under a name of its own and renames it when done.
+    Many processes may build at once: each builds in a folder of its own and renames it when done.
+
+    Raises:
+        OSError: a mesh cannot be read, or the folder cannot be written.
     """
     official = Path(icub_models.get_model_file(SOURCE_MODEL))
     meshes = official.parents[3]  # SHARE/iCub/robots/MODEL/model.urdf; package:// is SHARE
     source = urdf.Tree(ET.parse(official).getroot())
     inputs = [official, *icub_visuals.mesh_files(source, meshes)]
-    folder = _cache_folder(cache) / f"icub-{_digest(inputs)}"
+    folder = cache / f"icub-{_digest(inputs)}"
     if not folder.is_dir():
         _build_into(folder, source, meshes)
     return IcubModel(
@@ -148,12 +149,6 @@ def build_icub(cache: Path | None = None) -> IcubModel:
         seen_by_eye=icub_visuals.read_visuals(folder, "eye"),
         seen_from_outside=icub_visuals.read_visuals(folder, "outside"),
     )
-
-
-def _cache_folder(cache: Path | None) -> Path:
-    if cache is not None:
-        return cache
-    return Path(os.environ.get("VMDNN_CACHE") or Path.home() / ".cache" / "vmdnn")
 
 
 def _digest(inputs: Iterable[Path]) -> str:

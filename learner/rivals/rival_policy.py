@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,6 +11,7 @@ from learner.network.vision_input import vision_input
 from learner.rivals.networks import State, make_rival
 from proto.episode import Image
 from proto.errors import UserError
+from proto.variables import Situation
 
 
 class RivalPolicy:
@@ -52,7 +51,7 @@ class RivalPolicy:
             ) from error
         self._state: State = None
 
-    def begin(self, situation: Mapping[str, float], seed: int) -> None:  # noqa: ARG002
+    def begin(self, situation: Situation, seed: int) -> None:  # noqa: ARG002
         """Forget everything; situation and seed mean nothing to a network."""
         self._state = None
 

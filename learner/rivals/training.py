@@ -180,7 +180,7 @@ class RivalTrainer:
             UserError: there is no sequence to learn from.
         """
         torch.set_num_threads(config.learner.threads)
-        intake = Intake(store, config.network.image)
+        intake = Intake(store, config.task.name)
         self._episodes = intake.new()
         if not self._episodes:
             raise UserError(intake.complaint())

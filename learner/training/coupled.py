@@ -7,7 +7,6 @@ sequence is computed once, when the sequence comes in.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +24,7 @@ from learner.training.sequences import Sequences
 from proto.body import ACTION_NAMES
 from proto.config import LearnerConfig
 from proto.episode import Episode, Floats
+from proto.variables import Situation
 
 _log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class CoupledTraining:
         self._network = network
         self._config = config
         self._generator = generator
-        self._situations: list[Mapping[str, float]] = []
+        self._situations: list[Situation] = []
         self._seen: list[Tensor] = []
         self._codes: list[Tensor] = []
         self._targets: list[Floats] = []

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from math import prod
-from typing import Final
+from typing import Any, Final
 
 import torch
 from torch import Tensor
@@ -55,7 +55,7 @@ class Cells:
     situation off the grid has no neighbours, and its sequences are mixed with nothing else.
     """
 
-    def __init__(self, situations: Sequence[Mapping[str, float]], steps: Sequence[int]) -> None:
+    def __init__(self, situations: Sequence[Mapping[str, Any]], steps: Sequence[int]) -> None:
         """Find the cells.
 
         Args:

@@ -1,13 +1,14 @@
 """Pre-training of the vision as a delayed-response classifier (paper, section 3.3).
 
-The network watches a whole sequence. Only at its end it is asked, through a temporary softmax on
-the PFC, where the object was and how it lay. What answers are asked for, and in how many classes,
-is in the config. The temporary layer goes when coupled training begins.
+The network watches a whole sequence. In a window of it, by default its end, it is asked about the
+situation, through a temporary softmax layer on the PFC. The task says what is asked and when. The
+temporary layer is dropped when coupled training begins.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from learner.checkpoint import Classes
 from learner.network.mtrnn import run_levels
 from learner.network.vision_input import vision_input
 from learner.network.vmdnn import VMDNN
@@ -22,24 +24,47 @@ from learner.training.augmentation import disturbed
 from learner.training.loss import kl_divergence
 from proto.config import PretrainingConfig
 from proto.episode import Episode, Image
+from proto.errors import UserError
+from proto.variables import Question, Value
 
-Classes = Mapping[str, tuple[float, ...]]
-"""Centres of the classes, by name of the situation's value."""
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked about a variable.
+
+    Attributes:
+        variable: its name.
+        classes: the classes of the answer.
+        window: in which part of a sequence, see `proto.variables.Question`.
+    """
+
+    variable: str
+    classes: Classes
+    window: tuple[float, float]
 
 
-def classes_of(episodes: Sequence[Episode], labels: Mapping[str, int]) -> Classes:
-    """As many classes for each value as `labels` says, evenly over the episodes' situations."""
-    return {
-        name: _spread([episode.situation[name] for episode in episodes], count)
-        for name, count in labels.items()
-    }
+def classes_of(episodes: Sequence[Episode], questions: Sequence[Question]) -> dict[str, Classes]:
+    """The classes of each question's answer, from the episodes' situations.
+
+    Centres of classes are spread evenly over the values of a continuous variable; the classes of a
+    discrete one are its choices.
+    """
+    classes: dict[str, Classes] = {}
+    for question in questions:
+        values = [episode.situation[question.variable] for episode in episodes]
+        numbers = [value for value in values if not isinstance(value, str)]
+        if question.classes is None:
+            classes[question.variable] = tuple(sorted({str(value) for value in values}))
+        else:
+            classes[question.variable] = _spread(numbers, question.classes)
+    return classes
 
 
 class Pretraining:
     """Sequences, classifier and loss of pre-training.
 
     Attributes:
-        classes: centres of the classes.
+        asked: what is asked for, in the order of the temporary layer's outputs.
         classifier: the temporary layer, PFC to all classes.
         parameters: what is trained: V_F, V_S, what enters the PFC and its recurrence, classifier.
     """
@@ -47,7 +72,7 @@ class Pretraining:
     def __init__(
         self,
         network: VMDNN,
-        classes: Classes,
+        asked: Sequence[Asked],
         config: PretrainingConfig,
         generator: torch.Generator,
     ) -> None:
@@ -55,17 +80,17 @@ class Pretraining:
 
         Args:
             network: the network whose vision is to be formed.
-            classes: what is asked for; not empty.
-            config: when the answer is asked for, and how pictures are disturbed.
+            asked: what is asked for; not empty.
+            config: how pictures are disturbed.
             generator: draws the temporary layer's weights and the disturbance.
         """
-        self.classes = classes
+        self.asked = tuple(asked)
         self._network = network
         self._config = config
         self._generator = generator
         self._images: list[Image] = []
         self._labels: list[NDArray[np.float32]] = []
-        self._counts = [len(centres) for centres in classes.values()]
+        self._counts = [len(each.classes) for each in asked]
         self.classifier = nn.Linear(network.pfc.units, sum(self._counts))
         with torch.no_grad():
             for parameter in self.classifier.parameters():
@@ -83,9 +108,7 @@ class Pretraining:
 
     def add(self, episode: Episode) -> None:
         """Take a sequence in; a situation outside the classes counts as the nearest one."""
-        labels = [
-            soft_label(episode.situation[name], centres) for name, centres in self.classes.items()
-        ]
+        labels = [soft_label(episode.situation[each.variable], each.classes) for each in self.asked]
         self._labels.append(np.concatenate(labels))
         self._images.append(episode.images)
 
@@ -101,14 +124,17 @@ class Pretraining:
         images = [self._images[index] for index in indices]
         labels = torch.from_numpy(np.stack([self._labels[index] for index in indices]))
         answers = self.classifier(run_levels([self._network.pfc], self._see(images), "bottom_up"))
-        asked = self._asked([len(image) for image in images])
+        lengths = [len(image) for image in images]
         losses = [
             kl_divergence(
-                functional.log_softmax(answer, dim=-1).unsqueeze(2), label[:, None, None], asked
+                functional.log_softmax(answer, dim=-1).unsqueeze(2),
+                label[:, None, None],
+                in_window(lengths, each.window),
             )
-            for answer, label in zip(
+            for answer, label, each in zip(
                 torch.split(answers, self._counts, dim=-1),
                 torch.split(labels, self._counts, dim=-1),
+                self.asked,
                 strict=True,
             )
         ]
@@ -120,17 +146,28 @@ class Pretraining:
         seen = torch.from_numpy(vision_input(grey.numpy()))
         return self._network.see(disturbed(seen, self._config, self._generator))
 
-    def _asked(self, lengths: Sequence[int]) -> Tensor:
-        """(B, T) one in the last part of each sequence, where the answer is asked for."""
-        steps = torch.arange(max(lengths))
-        ends = torch.tensor(lengths)[:, None]
-        starts = (ends * (1 - self._config.answer_part)).floor()
-        return ((steps >= starts) & (steps < ends)).float()
+
+def in_window(lengths: Sequence[int], window: tuple[float, float]) -> Tensor:
+    """(B, T) one in the window of each sequence, where the answer is asked for."""
+    steps = torch.arange(max(lengths))
+    whole = torch.tensor(lengths)[:, None]
+    first, last = ((whole * share).floor() for share in window)
+    return ((steps >= first) & (steps < last)).float()
 
 
-def soft_label(value: float, centres: Sequence[float]) -> NDArray[np.float32]:
-    """(classes,) all on the class whose centre `value` is, shared between two in between."""
-    shares = [np.interp(value, centres, only) for only in np.eye(len(centres))]
+def soft_label(value: Value, classes: Classes) -> NDArray[np.float32]:
+    """Label (classes,) of a value: one for its class; between two centres it is shared.
+
+    Raises:
+        UserError: a choice that is none of the classes.
+    """
+    if isinstance(value, str):
+        if value not in classes:
+            raise UserError(
+                f"pre-training knows the choices {', '.join(map(str, classes))}, not {value!r}"
+            )
+        return np.array([value == each for each in classes], np.float32)
+    shares = [np.interp(value, np.asarray(classes, float), only) for only in np.eye(len(classes))]
     return np.asarray(shares, np.float32)
 
 

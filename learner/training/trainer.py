@@ -25,6 +25,7 @@ from learner.checkpoint import (
     NETWORK_PREFIX,
     Checkpoint,
     CheckpointMetadata,
+    Classes,
     CodeRanges,
     Tensors,
     TrainingMetadata,
@@ -37,7 +38,7 @@ from learner.network.softmax_code import SoftmaxCode
 from learner.network.vmdnn import VMDNN
 from learner.training.coupled import CoupledTraining
 from learner.training.optimization import Optimization, Plan
-from learner.training.pretraining import Classes, Pretraining, classes_of
+from learner.training.pretraining import Asked, Pretraining, classes_of
 from learner.training.schedule import Laps
 from learner.tutoring.selection import Intake
 from learner.tutoring.store import TutoringStore
@@ -45,6 +46,7 @@ from proto.config import Config
 from proto.episode import Episode
 from proto.errors import UserError
 from proto.metrics import Stage
+from proto.variables import Question
 
 _OPTIMIZER_PREFIX: Final = "optimizer."
 _RANDOM_STATE: Final = "random.state"
@@ -76,6 +78,7 @@ class Trainer:
         store: TutoringStore,
         pretraining_store: TutoringStore | None = None,
         *,
+        questions: Sequence[Question] = (),
         rounds: int = 0,
     ) -> None:
         """Start from random weights.
@@ -86,10 +89,17 @@ class Trainer:
             store: sequences to learn from.
             pretraining_store: sequences for pre-training, when they are others (the paper's have
                 no obstacle).
+            questions: what pre-training asks about the situations of its task.
             rounds: laps that follow the first, after corrections that somebody adds to the store.
         """
+        if config.learner.pretraining.epochs and not questions:
+            raise UserError(
+                f"the task {config.pretraining_task or config.task.name} asks no questions, so it"
+                " cannot be pre-trained on: set learner.pretraining.epochs=0"
+            )
         torch.set_num_threads(config.learner.threads)
         self._config = config
+        self._questions = tuple(questions)
         self._store = store
         self._pretraining_store = store if pretraining_store is None else pretraining_store
         learner = config.learner
@@ -112,6 +122,7 @@ class Trainer:
         store: TutoringStore,
         pretraining_store: TutoringStore | None = None,
         *,
+        questions: Sequence[Question] = (),
         rounds: int = 0,
     ) -> Self:
         """Go on where `save` was called.
@@ -127,7 +138,7 @@ class Trainer:
                 f"checkpoint {path} is a policy: it can act, but training cannot go on from it;"
                 " take a training checkpoint"
             )
-        trainer = cls(config, store, pretraining_store, rounds=rounds)
+        trainer = cls(config, store, pretraining_store, questions=questions, rounds=rounds)
         try:
             trainer._resume(checkpoint, training)
         except (KeyError, RuntimeError) as error:
@@ -226,10 +237,11 @@ class Trainer:
             self.stage = Stage.FINISHED
 
     def _make_intake(self) -> Intake:
-        image = self._config.network.image
+        task = self._config.task.name
         if self.stage is Stage.PRETRAINING:
-            return Intake(self._pretraining_store, image, self._config.learner.pretraining.labels)
-        return Intake(self._store, image)
+            asked = (question.variable for question in self._questions)
+            return Intake(self._pretraining_store, self._config.pretraining_task or task, asked)
+        return Intake(self._store, task)
 
     def _plan(self) -> Plan:
         learner = self._config.learner
@@ -262,15 +274,15 @@ class Trainer:
     def _first_lesson(self, episodes: Sequence[Episode]) -> Pretraining | CoupledTraining:
         """The lesson of this stage, its classes or ranges fixed from the first sequences."""
         if self.stage is Stage.PRETRAINING:
-            labels = self._config.learner.pretraining.labels
-            return self._pretraining(classes_of(episodes, labels))
+            return self._pretraining(classes_of(episodes, self._questions))
         targets = np.concatenate([episode.targets for episode in episodes])
         code = SoftmaxCode.of_actions(targets, self._config.network)
         return self._coupled_training(code)
 
-    def _pretraining(self, classes: Classes) -> Pretraining:
-        config = self._config.learner.pretraining
-        return Pretraining(self.network, classes, config, self._generator)
+    def _pretraining(self, classes: Mapping[str, Classes]) -> Pretraining:
+        windows = {question.variable: question.window for question in self._questions}
+        asked = [Asked(name, each, windows[name]) for name, each in classes.items()]
+        return Pretraining(self.network, asked, self._config.learner.pretraining, self._generator)
 
     def _coupled_training(self, code: SoftmaxCode) -> CoupledTraining:
         return CoupledTraining(self.network, code, self._config.learner, self._generator)
@@ -317,6 +329,8 @@ class Trainer:
             epoch=self.epochs_done,
             loss=self.loss,
             config_digest=self._config.digest(),
+            task=self._config.task.name,
+            backend=self._config.simulator.backend,
             network=self._config.network,
             code=code,
             cases=len(self._intake.situations),
@@ -325,8 +339,15 @@ class Trainer:
         )
 
     def _training_metadata(self) -> TrainingMetadata:
-        classes = self._lesson.classes if isinstance(self._lesson, Pretraining) else {}
-        return TrainingMetadata(sequences=tuple(self._intake.taken), classes=dict(classes))
+        sequences = tuple(self._intake.taken)
+        if not isinstance(self._lesson, Pretraining):
+            return TrainingMetadata(sequences=sequences, classes={})
+        asked = self._lesson.asked
+        return TrainingMetadata(
+            sequences=sequences,
+            classes={each.variable: each.classes for each in asked},
+            windows={each.variable: each.window for each in asked},
+        )
 
     def _network_parts(self) -> dict[str, Tensor]:
         return _prefixed(NETWORK_PREFIX, self.network.state_dict())

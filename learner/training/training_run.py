@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from learner.checkpoint import policy_file, pretraining_file, training_file
@@ -11,6 +11,7 @@ from learner.tutoring.store import TutoringStore
 from proto.config import Config, LearnerConfig
 from proto.metrics import Stage
 from proto.storage import written_whole
+from proto.variables import Question
 
 
 def open_training(
@@ -19,9 +20,12 @@ def open_training(
     store: TutoringStore,
     pretraining_store: TutoringStore | None,
     *,
+    questions: Sequence[Question],
     rounds: int = 0,
 ) -> Trainer:
     """Go on with the training of a run's folder, or start it where there is none.
+
+    `questions` is what pre-training asks about the situations of its task.
 
     Without actors there are no corrections, so there are no rounds of them unless they are asked
     for, whatever the configuration says.
@@ -31,8 +35,10 @@ def open_training(
     """
     path = training_file(folder)
     if path.exists():
-        return Trainer.restore(path, config, store, pretraining_store, rounds=rounds)
-    return Trainer(config, store, pretraining_store, rounds=rounds)
+        return Trainer.restore(
+            path, config, store, pretraining_store, questions=questions, rounds=rounds
+        )
+    return Trainer(config, store, pretraining_store, questions=questions, rounds=rounds)
 
 
 def run_training(

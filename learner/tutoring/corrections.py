@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 from proto.config import Config
@@ -12,14 +12,20 @@ from proto.episode import Episode, Kind
 from proto.leases import Leases
 from proto.messages import Correction, TutoringRequest, Verdict
 from proto.seeds import CORRECTIONS
+from proto.variables import Question, Situation
 
-Situation = Mapping[str, float]
 Policy = tuple[str, int]
 """A policy's training and version."""
 
 
 class Situations(Protocol):
-    """The situations of a task."""
+    """What the learner must know of a task.
+
+    Attributes:
+        questions: what pre-training asks about its situations.
+    """
+
+    questions: tuple[Question, ...]
 
     def tutored(self) -> Sequence[Situation]:
         """Those that are tutored, always in the same order."""

@@ -1,4 +1,4 @@
-"""Arguments that many subcommands share."""
+"""Arguments that several subcommands take, and what they mean."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 from proto.config import Config, load_config
+
+LARGEST_SEED: Final = 2**32 - 1
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
@@ -26,23 +29,23 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def add_connection(parser: argparse.ArgumentParser) -> None:
-    """Add --config, --set and --connect, for whatever looks at the bus."""
+    """Add --config, --set and --connect, for a command that uses the bus."""
     add_config(parser)
     parser.add_argument(
         "--connect",
         metavar="tcp/HOST:PORT",
-        help="where the hub listens; without it, the config's hub.endpoint",
+        help="where the hub listens; without it, hub.endpoint of the configuration",
     )
 
 
 def add_process(parser: argparse.ArgumentParser) -> None:
     """Add --config, --set, --connect and --id, for a process on the bus."""
     add_connection(parser)
-    parser.add_argument("--id", type=_id, help="what this process is called on the bus")
+    parser.add_argument("--id", type=_id, help="name of this process on the bus")
 
 
 def config_of(arguments: argparse.Namespace) -> Config:
-    """The configuration that the arguments of `add_config` or `add_process` ask for."""
+    """The configuration that the arguments of `add_config`, or of more than these, ask for."""
     overrides = list(arguments.overrides)
     if getattr(arguments, "connect", None) is not None:
         overrides.append(f"hub.endpoint={arguments.connect}")
@@ -50,7 +53,7 @@ def config_of(arguments: argparse.Namespace) -> Config:
 
 
 def start_logging(role: str) -> None:
-    """Log lines to standard error, each with time and role."""
+    """Log to standard error; each line has the time and the role."""
     logging.basicConfig(
         level=logging.INFO, format=f"%(asctime)s {role} %(levelname)s %(message)s", force=True
     )
@@ -65,7 +68,7 @@ def _id(text: str) -> str:
 
 
 def add_playing(parser: argparse.ArgumentParser) -> None:
-    """Add what every command that plays episodes without the bus takes, besides `add_config`."""
+    """Add --task, --backend and --workers, for a command that plays episodes without the bus."""
     parser.add_argument("--task", help="task to play; without it, task.name of the configuration")
     parser.add_argument(
         "--backend", help="simulator; without it, simulator.backend of the configuration"
@@ -86,16 +89,19 @@ def playing_config(arguments: argparse.Namespace, overrides: Sequence[str] = ())
 
 
 def seed(text: str) -> int:
-    """A whole number of at least zero, for `type=` of an argument."""
-    number = int(text)
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"{text} is less than 0")
-    return number
+    """A seed, for `type=` of an argument."""
+    return _integer(text, 0, LARGEST_SEED)
 
 
 def positive(text: str) -> int:
-    """A whole number of at least one, for `type=` of an argument."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text} is less than 1")
+    """An integer of at least one, for `type=` of an argument."""
+    return _integer(text, 1, None)
+
+
+def _integer(text: str, least: int, most: int | None) -> int:
+    """Raises argparse.ArgumentTypeError if the text is no integer in least..most."""
+    number = int(text) if re.fullmatch(r"[-+]?[0-9]{1,18}", text) else None
+    if number is None or number < least or (most is not None and number > most):
+        limits = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise argparse.ArgumentTypeError(f"{text!r} is not an integer {limits}")
     return number

@@ -14,7 +14,6 @@ from rich.box import SIMPLE
 from rich.console import Console
 from rich.table import Table
 
-from actors.tasks.experiment1.task import SUBTASKS
 from learner.checkpoint import load_checkpoint
 from learner.network.subnets import Subnet, subnets
 from learner.network.vision_probe import Answer, Probe, Vision, ask_classifier, probe
@@ -94,7 +93,8 @@ def _answer_table(answers: Sequence[Answer], sequences: int) -> Table:
     for column in ("value", "classes", "nearest class %", "mean error"):
         table.add_column(column, justify="left" if column == "value" else "right", no_wrap=True)
     for answer in answers:
-        right, error = f"{100 * answer.right:.1f}", _amount(answer.value, answer.error)
+        right = f"{100 * answer.right:.1f}"
+        error = "" if answer.error is None else _amount(answer.value, answer.error)
         table.add_row(answer.value, str(answer.classes), right, error)
     return table
 
@@ -111,10 +111,9 @@ def _probe_table(probes: Sequence[Probe], learned: int, tested: int) -> Table:
     table.add_column("phase", no_wrap=True)
     for value in values:
         table.add_column(value, justify="right", no_wrap=True)
-    names = dict(enumerate(SUBTASKS, 1))
-    for phase, group in groupby(probes, lambda probe: probe.phase):
+    for number, (phase, group) in enumerate(groupby(probes, lambda probe: probe.phase), 1):
         errors = (_amount(probe.value, probe.error) for probe in group)
-        table.add_row(f"{phase} {names.get(phase, '')}", *errors)
+        table.add_row(f"{number} {phase}", *errors)
     blind = {probe.value: probe.blind_error for probe in probes}
     table.add_section()
     table.add_row("without seeing", *(_amount(value, blind[value]) for value in values))

@@ -12,6 +12,7 @@ from typing import Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from actors.tasks.registry import make_pretraining_task
 from learner.checkpoint import policy_file, training_file
 from learner.training.trainer import Trainer
 from learner.training.training_run import open_training, run_training
@@ -39,7 +40,9 @@ def run(arguments: argparse.Namespace) -> int:
     config = config_of(arguments)
     store, others = training_stores(arguments)
     folder: Path = arguments.out
-    trainer = open_training(config, folder, store, others)
+    trainer = open_training(
+        config, folder, store, others, questions=make_pretraining_task(config).questions
+    )
     config.save(folder / "config.yaml")
     if trainer.finished:
         print(f"{folder} is trained already; learner.epochs above {trainer.epochs_done} goes on")

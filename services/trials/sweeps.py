@@ -17,6 +17,7 @@ from typing import Self
 
 from pydantic import ValidationError
 
+from actors.tasks.registry import make_pretraining_task
 from learner.checkpoint import load_checkpoint, policy_file, training_file
 from learner.rivals.networks import rival_config
 from learner.rivals.training import train_rival
@@ -126,7 +127,13 @@ def train(
     try:
         if rival is not None:
             return train_rival(config, rival, folder, store, go_on)
-        trainer = open_training(config, folder, store, pretraining_store)
+        trainer = open_training(
+            config,
+            folder,
+            store,
+            pretraining_store,
+            questions=make_pretraining_task(config).questions,
+        )
         run_training(trainer, config.learner, folder, go_on)
         return trainer.finished
     finally:

@@ -15,6 +15,9 @@ from proto.body import ACTION_VALUES
 from proto.config import Config
 from proto.episode import Episode
 from proto.errors import UserError
+from proto.variables import Question
+
+QUESTIONS = (Question("object_y_m", 3), Question("object_yaw_deg", 5))
 
 MakeConfig = Callable[..., Config]
 
@@ -26,7 +29,7 @@ def trainer(
     store = TutoringStore(tmp_path / "tutoring")
     for episode in bar_episodes():
         store.add(episode)
-    trainer = Trainer(small_config(pretraining=1), store)
+    trainer = Trainer(small_config(pretraining=1), store, questions=QUESTIONS)
     trainer.epoch()
     return trainer
 

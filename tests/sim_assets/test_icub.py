@@ -158,8 +158,3 @@ def test_many_may_build_at_once(tmp_path: Path):
     assert len(set(models)) == 1
     assert models[0].urdf.is_file()
     assert list(tmp_path.iterdir()) == [models[0].urdf.parent]
-
-
-def test_the_cache_folder_comes_from_the_environment(built, monkeypatch):
-    monkeypatch.setenv("VMDNN_CACHE", str(built.urdf.parent.parent))
-    assert build_icub() == built

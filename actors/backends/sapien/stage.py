@@ -7,27 +7,19 @@ details from outside.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import sapien
-from numpy.typing import NDArray
 from sapien import render
 
-from actors.simulator import Box
+from actors.backends.eye import FAR_M, NEAR_M
+from actors.simulator import Box, Image
 from sim_assets.icub_visuals import Visual
 
-Picture = NDArray[np.uint8]
-
-# Mesa's software renderer otherwise starts a thread for each core, and actors fight for them.
-os.environ.setdefault("LP_NUM_THREADS", "0")
-
 SHADER: Final = Path(__file__).parent / "shader"
-NEAR_M: Final = 0.01
-FAR_M: Final = 5.0
 
 
 class Stage:
@@ -59,13 +51,11 @@ class Stage:
 
     def picture(
         self, eye: sapien.Pose, width: int, height: int, focal: tuple[float, float]
-    ) -> Picture:
-        """Take a picture (height, width, 4) uint8: sRGB colours, and what is not sky.
-
-        Where no body is seen, all four values are 0; elsewhere the last is 255.
+    ) -> Image:
+        """Rendered picture (height, width, 4) uint8, as `actors.backends.eye` describes it.
 
         Args:
-            eye: x along the optical axis, y left, z up.
+            eye: pose of the camera: x along the optical axis, y left, z up.
             width: pixels across.
             height: pixels down.
             focal: focal lengths in these pixels, across and down.
@@ -94,18 +84,6 @@ class Stage:
         entity.add_component(body)
         self._scene.add_entity(entity)
         return entity
-
-
-def looking_at(place_m: Sequence[float], target_m: Sequence[float]) -> sapien.Pose:
-    """Pose at a place, x towards a target that is not straight above or below, z upwards."""
-    x = np.subtract(target_m, place_m)
-    x /= np.linalg.norm(x)
-    y = np.cross([0.0, 0.0, 1.0], x)
-    y /= np.linalg.norm(y)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([x, y, np.cross(x, y)], axis=1)
-    matrix[:3, 3] = place_m
-    return sapien.Pose(matrix)
 
 
 def _box_shape(box: Box) -> Any:

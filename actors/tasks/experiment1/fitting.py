@@ -25,7 +25,6 @@ from actors.posture_fitting import (
     fit_polynomial,
     shortfall,
 )
-from actors.tasks.contract import Situation
 from actors.tasks.experiment1.postures import (
     FITTED,
     OBJECT_ORDERS,
@@ -34,7 +33,7 @@ from actors.tasks.experiment1.postures import (
     object_features,
     obstacle_features,
 )
-from actors.tasks.experiment1.task import (
+from actors.tasks.experiment1.world import (
     OBJECT_SIZE_M,
     OBSTACLE_SIZE_M,
     START,
@@ -43,6 +42,8 @@ from actors.tasks.experiment1.task import (
     obstacle_pose,
 )
 from proto.body import ARM
+from proto.storage import written_whole
+from proto.variables import Situation, number_of
 from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
 
 Array = NDArray[np.float64]
@@ -270,7 +271,7 @@ class PostureFitter:
 
 def _object_box(situation: Situation) -> ClearanceBox:
     pose = object_pose(situation)
-    yaw = np.deg2rad(-situation["object_yaw_deg"])
+    yaw = np.deg2rad(-number_of(situation, "object_yaw_deg"))
     return ClearanceBox(np.array(pose.position_m), np.array(OBJECT_SIZE_M), float(yaw))
 
 
@@ -281,8 +282,8 @@ def _obstacle_box(situation: Situation) -> ClearanceBox:
 def main() -> None:
     """Fit all key postures and write them where `load_key_postures` finds them."""
     text = PostureFitter().fit().to_json()
-    with as_file(FITTED) as path:
-        path.write_text(text)
+    with as_file(FITTED) as path, written_whole(path) as stream:
+        stream.write(text.encode())
     print(f"wrote {FITTED}")
 
 

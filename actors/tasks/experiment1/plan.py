@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from actors.attention import clip_action
 from actors.kinematics import Gaze
 from actors.motion import minimum_jerk, ramp, travel
-from actors.tasks.contract import Situation
 from actors.tasks.experiment1.postures import KeyPostures, load_key_postures
-from actors.tasks.experiment1.task import (
+from actors.tasks.experiment1.world import (
     START,
     SUBTASKS,
     TABLE_DROP_M,
@@ -21,6 +20,7 @@ from actors.tasks.experiment1.task import (
     obstacle_pose,
 )
 from proto.body import ARM, FOCUS, GRASP, NECK
+from proto.variables import Situation
 
 Array = NDArray[np.float64]
 

@@ -1,6 +1,6 @@
 #version 450
-// Matt surfaces under a bright sky and a sun behind the robot's left shoulder, without shadows.
-// SAPIEN's own shaders do far more; compiling them takes seconds, and this one draws twice as fast.
+// Matt surfaces in the light of actors/backends/light.py, without shadows.
+// SAPIEN's own shaders take seconds to compile, and twice as long to draw.
 
 layout(set = 2, binding = 0) uniform MaterialBuffer {
   vec4 emission;
@@ -35,9 +35,10 @@ const vec3 TO_SUN = vec3(-0.26, -0.43, 0.865);
 const float SUN = 0.4;
 const float SKY = 0.55;
 const float GROUND = 0.35;
+const float GAMMA = 2.2;
 
 void main() {
   vec3 normal = normalize(worldNormal);
   float light = mix(GROUND, SKY, 0.5 + 0.5 * normal.z) + SUN * max(dot(normal, TO_SUN), 0.0);
-  outColor = vec4(pow(light * material.baseColor.rgb, vec3(1.0 / 2.2)), 1.0);
+  outColor = vec4(pow(light * material.baseColor.rgb, vec3(1.0 / GAMMA)), 1.0);
 }

@@ -10,19 +10,21 @@ from actors.kinematics import Arm, ClearanceBox, Gaze
 from actors.tasks.experiment1.fitting import PostureFitter
 from actors.tasks.experiment1.plan import plan
 from actors.tasks.experiment1.postures import load_key_postures
-from actors.tasks.experiment1.task import (
+from actors.tasks.experiment1.world import (
     OBSTACLE_SIZE_M,
     START,
     TABLE_DROP_M,
-    Experiment1,
     object_pose,
     obstacle_pose,
 )
+from actors.tasks.registry import make_task
 from proto.body import ACTION_VALUES, ARM, FOCUS, GRASP, NECK
+from proto.config import TaskConfig
 from sim_assets.hand import OPEN_DEG
 
+TASK = make_task(TaskConfig())
 situations = st.fixed_dictionaries(
-    {name: st.floats(*limits) for name, limits in Experiment1().ranges().items()}
+    {each.name: st.floats(each.minimum, each.maximum) for each in TASK.variables}
 )
 ARM_OPEN = Arm(OPEN_DEG, TABLE_DROP_M)
 
@@ -53,7 +55,7 @@ def test_open_arm_passes_the_obstacle_closely_but_clear(situation):
 
 
 def test_neighbouring_cases_have_neighbouring_plans():
-    plans = {tuple(case.values()): plan(case) for case in Experiment1().tutored()}
+    plans = {tuple(case.values()): plan(case) for case in TASK.tutored()}
     axes = [sorted({key[axis] for key in plans}) for axis in range(3)]
     steps = [
         np.abs(plans[a] - plans[b])[:, ARM].max()
@@ -65,15 +67,15 @@ def test_neighbouring_cases_have_neighbouring_plans():
 
 
 def test_attention_follows_the_subtasks():
-    task = Experiment1()
+    task = TASK
     situation = task.sample(3)
     actions = plan(situation)
-    looking_at_object = actions[task.phases == 5]
+    looking_at_object = actions[task.phases == 4]
     assert np.ptp(looking_at_object[:, NECK], axis=0).max() < 0.1
-    assert (actions[task.phases <= 5][:, FOCUS] == 1.0).all()
-    assert (actions[task.phases >= 7][:, FOCUS] == 20.0).all()
-    assert (actions[task.phases <= 6][:, GRASP] == 1.0).all()
-    assert (actions[task.phases == 8][:, GRASP] == 10.0).all()
+    assert (actions[task.phases <= 4][:, FOCUS] == 1.0).all()
+    assert (actions[task.phases >= 6][:, FOCUS] == 20.0).all()
+    assert (actions[task.phases <= 5][:, GRASP] == 1.0).all()
+    assert (actions[task.phases == 7][:, GRASP] == 10.0).all()
 
 
 def test_gaze_centres_what_the_neck_can_reach():
