@@ -39,7 +39,7 @@ class RecordedGestures:
             raise GestureVideoError(f"{folder}: there is no such folder of gesture videos")
         self._clips = {side: [read_clip(path) for path in _videos(folder, side)] for side in SIDES}
         fewest = min(len(clips) for clips in self._clips.values())
-        self.subjects = (SUBJECT,)
+        self.subjects: tuple[str, ...] = (SUBJECT,)
         self.takes = tuple(str(number) for number in range(fewest))
 
     def clip(self, side: Side, subject: str, take: str) -> Clip:

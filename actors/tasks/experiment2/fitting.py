@@ -31,15 +31,13 @@ from actors.tasks.experiment2.postures import (
     FAMILIES,
     FITTED,
     ORDERS,
-    Y_RANGE_M,
-    YAW_RANGE_DEG,
     Family,
     FamilyPostures,
     KeyPostures,
     features,
 )
-from actors.tasks.experiment2.scene import START, TABLE_DROP_M
-from actors.tasks.experiment2.setting import KINDS, PLACES, PlacedObject
+from actors.tasks.experiment2.setting import KINDS, PlacedObject, other_place
+from actors.tasks.experiment2.world import START, TABLE_DROP_M, Y_RANGE_M, YAW_RANGE_DEG
 from proto.body import ARM
 from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
 
@@ -103,16 +101,14 @@ class FamilyFitter:
         self._arm = Arm(OPEN_DEG, TABLE_DROP_M)
         self._start = np.deg2rad(START[ARM])
         grid = [
-            PlacedObject(*family, float(y), float(yaw))
+            PlacedObject("indicated", *family, float(y), float(yaw))
             for y in np.linspace(*Y_RANGE_M, GRID_POINTS)
             for yaw in np.linspace(*YAW_RANGE_DEG, GRID_POINTS)
         ]
         self._boxes = [_clearance_box(placed) for placed in grid]
         self._features = np.array([features(placed.y_m, placed.yaw_deg) for placed in grid])
         self._others = [
-            _clearance_box(PlacedObject(kind, place, y, 0.0))
-            for place in PLACES
-            if place != self._place
+            _clearance_box(PlacedObject("other", kind, other_place(self._place), y, 0.0))
             for kind in KINDS
             for y in Y_RANGE_M
         ]

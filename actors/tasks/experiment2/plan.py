@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache
 from typing import Final
 
@@ -13,9 +12,10 @@ from actors.attention import clip_action
 from actors.kinematics import Gaze
 from actors.motion import minimum_jerk, ramp, travel
 from actors.tasks.experiment2.postures import FamilyPostures, load_key_postures
-from actors.tasks.experiment2.scene import START, SUBTASKS, TABLE_DROP_M
 from actors.tasks.experiment2.setting import PlacedObject, Setting
+from actors.tasks.experiment2.world import START, SUBTASKS, TABLE_DROP_M
 from proto.body import ARM, FOCUS, GRASP, NECK
+from proto.variables import Situation
 
 Array = NDArray[np.float64]
 
@@ -33,9 +33,9 @@ TASK_SPACE_M: Final = np.array([0.04, 0.25, 0.04])
 _TOTAL: Final = sum(SUBTASKS.values())
 
 
-def plan(situation: Mapping[str, float | str]) -> Array:
+def plan(situation: Situation) -> Array:
     """Actions (148, 11) that carry out Experiment II in a situation (see `proto.body`)."""
-    target = Setting.of(situation).target
+    target = Setting.of(situation).indicated
     begins = dict(zip(SUBTASKS, np.cumsum([0, *SUBTASKS.values()]).tolist(), strict=False))
     actions = np.tile(START, (_TOTAL, 1))
     actions[:, ARM] = _arm(target, load_key_postures().for_object(target))
@@ -50,7 +50,7 @@ def _gaze() -> Gaze:
     return Gaze(TABLE_DROP_M)
 
 
-def _neck(target: PlacedObject, begins: Mapping[str, int]) -> Array:
+def _neck(target: PlacedObject, begins: dict[str, int]) -> Array:
     """Neck pitch and yaw (148, 2): the screen, then the task space, then the object."""
     at_task_space = _gaze().neck_deg(TASK_SPACE_M)
     at_object = _gaze().neck_deg(np.array(target.pose.position_m))

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.tasks.experiment2.setting import KINDS, PLACES, Kind, Place, PlacedObject
+from actors.tasks.experiment2.world import Y_RANGE_M, YAW_RANGE_DEG
 
 Array = NDArray[np.float64]
 Family = tuple[Kind, Place]
@@ -24,8 +25,6 @@ Family = tuple[Kind, Place]
 FAMILIES: Final[tuple[Family, ...]] = tuple((kind, place) for kind in KINDS for place in PLACES)
 POSTURES: Final = ("above", "approach_1", "approach_2", "grasp", "lift_1", "lift_2")
 """Postures that depend on where the object is and how it is turned."""
-Y_RANGE_M: Final = (0.235, 0.285)
-YAW_RANGE_DEG: Final = (-15.0, 15.0)
 
 _POWERS: Final = tuple((y, yaw) for y in range(3) for yaw in range(3))
 ORDERS: Final = np.array([a + b for a, b in _POWERS])

@@ -14,14 +14,18 @@ from typing import Final, Literal, cast
 import numpy as np
 
 from actors.simulator import Pose
+from proto.variables import Situation, number_of
 from sim_assets.gestures.clip import Side
 
 Kind = Literal["standing", "laying"]
 Place = Literal["-0.15", "0.07"]
 """X of an object in the task frame (m), as text."""
+Role = Literal["indicated", "other"]
+"""Whether the person points at an object."""
 
 KINDS: Final[tuple[Kind, ...]] = ("standing", "laying")
 PLACES: Final[tuple[Place, ...]] = ("-0.15", "0.07")
+ROLES: Final[tuple[Role, ...]] = ("indicated", "other")
 SIZES_M: Final[Mapping[Kind, tuple[float, float, float]]] = {
     "standing": (0.028, 0.07, 0.15),
     "laying": (0.028, 0.15, 0.07),
@@ -31,7 +35,7 @@ POINTED_SIDES: Final[Mapping[Place, Side]] = {"-0.15": "picture-right", "0.07": 
 """Where the person on the screen points for each place: the screen faces the robot, so the
 picture's right is the robot's right."""
 
-INDICATED: Final = "indicated_x_m"
+INDICATED_X: Final = "indicated_x_m"
 SUBJECT: Final = "subject"
 TAKE: Final = "take"
 
@@ -41,31 +45,23 @@ class PlacedObject:
     """One of the two objects.
 
     Attributes:
+        role: which of the two it is.
         kind: how it is put up.
         place: its X.
         y_m: its Y.
         yaw_deg: its turn about the vertical.
     """
 
+    role: Role
     kind: Kind
     place: Place
     y_m: float
     yaw_deg: float
 
-    @classmethod
-    def of(cls, situation: Mapping[str, float | str], place: Place) -> PlacedObject:
-        """The object that a situation puts at a place."""
-        return cls(
-            kind=cast("Kind", situation[kind_name(place)]),
-            place=place,
-            y_m=float(situation[y_name(place)]),
-            yaw_deg=float(situation[yaw_name(place)]),
-        )
-
     @property
     def name(self) -> str:
         """What the object is called in the scene."""
-        return f"object_at_{self.place}"
+        return f"{self.role}_object"
 
     @property
     def size_m(self) -> tuple[float, float, float]:
@@ -92,53 +88,49 @@ class Setting:
     """A situation of Experiment II.
 
     Attributes:
-        target: the object at which the person points.
+        indicated: the object at which the person points.
         other: the other object.
         subject: name of the person.
         take: name of the recording.
     """
 
-    target: PlacedObject
+    indicated: PlacedObject
     other: PlacedObject
     subject: str
     take: str
 
     @classmethod
-    def of(cls, situation: Mapping[str, float | str]) -> Setting:
+    def of(cls, situation: Situation) -> Setting:
         """The setting that the values of a situation describe."""
-        indicated = cast("Place", situation[INDICATED])
-        other = next(place for place in PLACES if place != indicated)
+        place = cast("Place", situation[INDICATED_X])
         return cls(
-            target=PlacedObject.of(situation, indicated),
-            other=PlacedObject.of(situation, other),
+            indicated=_placed(situation, "indicated", place),
+            other=_placed(situation, "other", other_place(place)),
             subject=str(situation[SUBJECT]),
             take=str(situation[TAKE]),
         )
 
     @property
-    def objects(self) -> tuple[PlacedObject, PlacedObject]:
-        """Both objects, in the order of PLACES."""
-        first, second = sorted(
-            (self.target, self.other), key=lambda placed: PLACES.index(placed.place)
-        )
-        return first, second
-
-    @property
     def side(self) -> Side:
         """Where in the picture the person points."""
-        return POINTED_SIDES[self.target.place]
+        return POINTED_SIDES[self.indicated.place]
 
 
-def kind_name(place: Place) -> str:
-    """Name of the value that says which kind of object is at a place."""
-    return f"kind_at_{place}"
+def variable_name(role: Role, value: Literal["kind", "y_m", "yaw_deg"]) -> str:
+    """Name of the variable that holds a value of one of the objects."""
+    return f"{role}_{value}"
 
 
-def y_name(place: Place) -> str:
-    """Name of the value that says which Y the object at a place has."""
-    return f"y_at_{place}_m"
+def other_place(place: Place) -> Place:
+    """The place where the other object is."""
+    return next(each for each in PLACES if each != place)
 
 
-def yaw_name(place: Place) -> str:
-    """Name of the value that says how the object at a place is turned."""
-    return f"yaw_at_{place}_deg"
+def _placed(situation: Situation, role: Role, place: Place) -> PlacedObject:
+    return PlacedObject(
+        role=role,
+        kind=cast("Kind", situation[variable_name(role, "kind")]),
+        place=place,
+        y_m=number_of(situation, variable_name(role, "y_m")),
+        yaw_deg=number_of(situation, variable_name(role, "yaw_deg")),
+    )

@@ -1,4 +1,4 @@
-"""The scene of Experiment II: a table, two objects, and a screen behind them."""
+"""The world of Experiment II: a table, two objects, and a screen behind them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Final
 import numpy as np
 
 from actors.attention import targets_of_action
-from actors.simulator import Box, Pose, Scene
+from actors.simulator import Box, Pose, Scene, Screen
 from actors.tasks.experiment2.setting import Kind, PlacedObject, Setting
+from sim_assets.gestures.clip import Clip
 
 SUBTASKS: Final[Mapping[str, int]] = {
     "observe gesture": 40,
@@ -25,6 +26,11 @@ SUBTASKS: Final[Mapping[str, int]] = {
 
 START: Final = np.array([26.4, -1.8, -3.0, 54.0, -22.0, 18.0, -32.0, -9.0, 10.0, 1.0, 1.0])
 """Action (11,) whose posture every episode starts from: the eye looks at the screen."""
+
+Y_RANGE_M: Final = (0.235, 0.285)
+YAW_RANGE_DEG: Final = (-15.0, 15.0)
+"""Ranges of both objects. Nearer than this the elbow cannot bend enough for a standing object at
+X = -0.15; farther, the hand comes down too slantingly on a laying object at X = 0.07."""
 
 # The height of the table is where the arm reaches every family over the whole ranges.
 TABLE_SIZE_M: Final = (0.90, 0.44, 0.04)
@@ -44,12 +50,13 @@ COLOURS: Final[Mapping[Kind, tuple[float, float, float]]] = {
 """The kinds differ in shade, so that a picture of 64 x 48 grey pixels tells them apart."""
 
 
-def scene_of(setting: Setting) -> Scene:
-    """Table and objects."""
+def scene(setting: Setting, clip: Clip) -> Scene:
+    """Table and objects, and the screen that shows a clip (40, 96, 96) uint8."""
     return Scene(
-        boxes=(_table(), *(_box(placed) for placed in setting.objects)),
+        boxes=(_table(), _box(setting.indicated), _box(setting.other)),
         start=targets_of_action(START),
         table_drop_m=TABLE_DROP_M,
+        screen=Screen(SCREEN_SIZE_M, Pose(SCREEN_CENTRE_M), clip),
     )
 
 
