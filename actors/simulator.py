@@ -26,6 +26,8 @@ Image = NDArray[np.uint8]
 
 EYE_WIDTH: Final = 320
 EYE_HEIGHT: Final = 240
+DARK_SCREEN: Final = 20
+"""Grey level of a screen that shows nothing."""
 ROBOT: Final = "robot"
 """Name of the robot in contact reports."""
 
@@ -104,6 +106,31 @@ class JointTargets:
     hand_deg: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """A flat screen that shows one grey frame in each control step. Nothing can touch it.
+
+    A screen glows: the picture shows its grey levels as they are, whatever the light.
+
+    Attributes:
+        size_m: width and height.
+        pose: of its centre; unturned, it stands upright and faces -y, towards the robot, with the
+            left edge of its frames at -x.
+        frames: (N, height, width) uint8; frame t is shown while the robot observes at control step
+            t, counted from 0. After the last frame the screen is dark.
+    """
+
+    size_m: tuple[float, float]
+    pose: Pose
+    frames: Image
+
+    def frame(self, step: int) -> Image:
+        """What the screen shows at a control step: (height, width) uint8."""
+        if step < len(self.frames):
+            return np.asarray(self.frames[step], dtype=np.uint8)
+        return np.full(self.frames.shape[1:], DARK_SCREEN, dtype=np.uint8)
+
+
 @dataclass(frozen=True)
 class Scene:
     """The initial state of an episode.
@@ -112,11 +139,13 @@ class Scene:
         boxes: table, obstacle, objects.
         start: posture in which the robot starts, at rest.
         table_drop_m: how far the table top lies below the robot's root link (m).
+        screen: a screen, if there is one.
     """
 
     boxes: tuple[Box, ...]
     start: JointTargets
     table_drop_m: float
+    screen: Screen | None = None
 
 
 @dataclass(frozen=True)
@@ -234,8 +263,14 @@ class Simulator(Protocol):
         """True pose of every box and of every moving link of the robot, by name."""
 
     @abstractmethod
-    def show(self, joints_deg: Array, boxes: Mapping[str, Pose]) -> None:
-        """Put the robot and boxes into a recorded state, for pictures; not during an episode."""
+    def show(self, joints_deg: Array, boxes: Mapping[str, Pose], step: int) -> None:
+        """Put robot, boxes and screen into a recorded state, for pictures; not during an episode.
+
+        Args:
+            joints_deg: (18,) joint angles, as `joints_deg` measures them.
+            boxes: poses of boxes by name; the others stay where they are.
+            step: control step of the recorded state, which the screen shows.
+        """
 
     @abstractmethod
     def eye_picture(self, crop: Crop, width: int, height: int) -> Image:

@@ -12,6 +12,7 @@ from proto.extensions import check_attributes, load_class
 TASKS: Final[Mapping[str, str]] = {
     "experiment1": "actors.tasks.experiment1.task:Experiment1",
     "reaching": "actors.tasks.experiment1.reaching:Reaching",
+    "experiment2": "actors.tasks.experiment2.task:Experiment2",
 }
 _METHODS: Final = ("tutored", "sample", "check", "corners", "scene", "plan", "judge")
 _ATTRIBUTES: Final = (

@@ -75,7 +75,7 @@ def frames(episode: Episode, simulator: Simulator) -> Iterator[Picture]:
     for step in range(episode.steps):
         poses = _poses(episode, step)
         joints_deg = episode.joints_deg[step].astype(np.float64)
-        simulator.show(joints_deg, {name: poses[name] for name in boxes & poses.keys()})
+        simulator.show(joints_deg, {name: poses[name] for name in boxes & poses.keys()}, step)
         outside = simulator.outside_picture(PANEL_WIDTH, PANEL_HEIGHT).copy()
         _write_lines(outside, _caption(episode, step))
         focus = _focus_before(episode, step, float(task.start[FOCUS]))

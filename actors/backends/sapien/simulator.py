@@ -62,6 +62,7 @@ class SapienSimulator:
         self._scene: Scene | None = None
         self._current_world: World | None = None
         self._targets_deg = np.zeros(MOTOR_COUNT)
+        self._step = 0
         # Measured once a step at most: players ask before and after each step.
         self._joints_deg: Array | None = None
         self._bodies: Bodies | None = None
@@ -74,6 +75,7 @@ class SapienSimulator:
     def reset(self, scene: Scene) -> None:
         """Replace the previous scene by `scene`; the same scene gives the same episode."""
         self._scene = scene
+        self._step = 0
         self._targets_deg = motors_of(scene.start)
         self._current_world = World(
             self._builder,
@@ -85,7 +87,7 @@ class SapienSimulator:
         self._forget()
         for renderer in (self._eye_renderer, self._outside_renderer):
             if renderer is not None:
-                renderer.set_boxes(scene.boxes)
+                renderer.set_scene(scene)
 
     def step(self, targets: JointTargets) -> StepReport:
         """Run one control period, moving the motors' targets linearly to `targets`.
@@ -104,6 +106,7 @@ class SapienSimulator:
             world.step()
             touches.update(world.touches())
         self._targets_deg = after
+        self._step += 1
         self._forget()
         return StepReport(frozenset(touches))
 
@@ -127,9 +130,16 @@ class SapienSimulator:
             self._bodies = self._world.bodies()
         return self._bodies
 
-    def show(self, joints_deg: Array, boxes: Mapping[str, Pose]) -> None:
-        """Put the robot and boxes into a recorded state, for pictures; not during an episode."""
+    def show(self, joints_deg: Array, boxes: Mapping[str, Pose], step: int) -> None:
+        """Put robot, boxes and screen into a recorded state, for pictures; not during an episode.
+
+        Args:
+            joints_deg: (18,) joint angles, as `joints_deg` measures them.
+            boxes: poses of boxes by name; the others stay where they are.
+            step: control step of the recorded state, which the screen shows.
+        """
         self._world.put(joints_from_motors_rad(joints_deg), boxes)
+        self._step = step
         self._forget()
 
     def eye_picture(self, crop: Crop, width: int, height: int) -> Image:
@@ -140,7 +150,7 @@ class SapienSimulator:
         """Colour picture (height, width, 3) uint8 of the scene from outside, full meshes."""
         if self._outside_renderer is None:
             self._outside_renderer = self._make_renderer(self._model.seen_from_outside)
-        self._outside_renderer.place(self._world.poses())
+        self._outside_renderer.place(self._world.poses(), self._step)
         factor = eye.OUTSIDE_SUPERSAMPLING
         fine = self._outside_renderer.picture(
             sapien.Pose(eye.outside_pose()),
@@ -169,12 +179,12 @@ class SapienSimulator:
         if self._eye_renderer is None:
             self._eye_renderer = self._make_renderer(self._model.seen_by_eye)
         poses = self._world.poses()
-        self._eye_renderer.place(poses)
+        self._eye_renderer.place(poses, self._step)
         focal = eye.eye_focal_lengths(crop, width, height)
         return self._eye_renderer.picture(poses[EYE], width, height, focal)
 
     def _make_renderer(self, robot: tuple[Visual, ...]) -> Renderer:
         renderer = Renderer(robot)
         if self._scene is not None:
-            renderer.set_boxes(self._scene.boxes)
+            renderer.set_scene(self._scene)
         return renderer
