@@ -15,13 +15,16 @@ import numpy as np
 import pytest
 
 from actors.backends import light
+from actors.backends.eye import SKY
 from actors.simulator import (
+    DARK_SCREEN,
     ROBOT,
     Box,
     Crop,
     JointTargets,
     Pose,
     Scene,
+    Screen,
     Simulator,
     load_backend,
     make_simulator,
@@ -296,7 +299,7 @@ def test_a_recorded_state_can_be_shown_again(seeing):
     picture = seeing.eye_picture(Crop(), 160, 120)
     seeing.reset(scene())
     assert np.abs(seeing.eye_picture(Crop(), 160, 120).astype(int) - picture).mean() > 2.0
-    seeing.show(joints, {name: bodies[name] for name in ("table", "obstacle", "object")})
+    seeing.show(joints, {name: bodies[name] for name in ("table", "obstacle", "object")}, 8)
     assert np.abs(seeing.eye_picture(Crop(), 160, 120).astype(int) - picture).mean() < 0.5
     for name in ("r_hand_dh_frame", "object", "head"):
         assert seeing.bodies()[name].position_m == pytest.approx(bodies[name].position_m, abs=1e-3)
@@ -321,6 +324,61 @@ def test_a_surface_is_as_bright_as_the_shared_light_says(seeing, normal, quatern
     row, column = seen_at(seeing, centre + 0.005 * np.array(normal), 640, 480)
     expected = light.brightness(np.array(normal, dtype=float)) * np.array(colour)
     assert picture[row, column] == pytest.approx(255 * expected ** (1 / light.GAMMA), abs=1.5)
+
+
+SCREEN_CENTRE = (-0.034, 0.5, 0.24)
+"""In the middle of the eye image when the neck is at zero."""
+
+
+def screen_scene(*frames, boxes=(TABLE,)) -> Scene:
+    """A scene with a screen that the eye looks at."""
+    screen = Screen((0.16, 0.12), Pose(SCREEN_CENTRE), np.array(frames, dtype=np.uint8))
+    return replace(scene(*boxes, start=targets(neck=(0.0, 0.0))), screen=screen)
+
+
+def plain(grey) -> np.ndarray:
+    return np.full((12, 16), grey)
+
+
+def test_a_screen_shows_one_frame_in_each_control_step_and_then_is_dark(seeing):
+    seeing.reset(screen_scene(plain(40), plain(120), plain(200)))
+    shown = []
+    for _ in range(5):
+        shown.append(grey_at(seeing, SCREEN_CENTRE))
+        seeing.step(targets(neck=(0.0, 0.0)))
+    assert shown == pytest.approx([40, 120, 200, DARK_SCREEN, DARK_SCREEN], abs=1)
+    seeing.reset(screen_scene(plain(90)))
+    assert grey_at(seeing, SCREEN_CENTRE) == pytest.approx(90, abs=1)
+    seeing.reset(scene(TABLE, start=targets(neck=(0.0, 0.0))))
+    assert grey_at(seeing, SCREEN_CENTRE) == pytest.approx(SKY, abs=1), "the screen is gone"
+
+
+def test_a_screen_stands_upright_with_its_left_edge_at_minus_x(seeing):
+    frame = np.block([[plain(50), plain(100)], [plain(150), plain(200)]])
+    seeing.reset(screen_scene(frame))
+    x, y, z = SCREEN_CENTRE
+    corners = [(x + dx, y, z + dz) for dz in (0.03, -0.03) for dx in (-0.04, 0.04)]
+    seen = [grey_at(seeing, corner) for corner in corners]
+    assert seen == pytest.approx([50, 100, 150, 200], abs=1)
+
+
+def test_a_recorded_step_of_a_screen_can_be_shown_again(seeing):
+    seeing.reset(screen_scene(plain(40), plain(120), plain(200)))
+    seeing.show(seeing.joints_deg(), {}, 2)
+    assert grey_at(seeing, SCREEN_CENTRE) == pytest.approx(200, abs=1)
+
+
+def test_nothing_touches_a_screen(blind):
+    x, y, z = SCREEN_CENTRE
+    above = Pose((x, y, z + 0.15))
+    falling = Box("falling", (0.04, 0.04, 0.04), above, (1, 1, 1), mass_kg=0.1)
+    heights_m = []
+    for start in (screen_scene(plain(40), boxes=(falling,)), scene(falling)):
+        blind.reset(start)
+        for _ in range(4):
+            blind.step(start.start)
+        heights_m.append(blind.bodies()["falling"].position_m[2])
+    assert heights_m[0] == heights_m[1] < z - 0.1
 
 
 def share_of(picture, red, green, blue):
