@@ -20,6 +20,9 @@ Count = Annotated[int, Integer(0, 2**31)]
 Seed = Annotated[int, Integer(0, 2**63 - 1)]
 Values = Annotated[Mapping[str, float], Table(Number(), most=32)]
 
+PolicyKey = tuple[str, int]
+"""What identifies a policy: id of its training, and its version."""
+
 
 @message("policy", 1, limit=POLICY_LIMIT + MEBIBYTE)
 @dataclass(frozen=True)
