@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Self, cast
 
@@ -23,6 +23,7 @@ from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import NetworkConfig
 from proto.episode import Floats, Image
 from proto.errors import UserError
+from proto.variables import Situation
 
 
 class NetworkPolicy:
@@ -85,7 +86,7 @@ class NetworkPolicy:
         """
         return cls(checkpoint_from_bytes(blob, "the policy"), "the policy")
 
-    def begin(self, situation: Mapping[str, float], seed: int) -> None:  # noqa: ARG002
+    def begin(self, situation: Situation, seed: int) -> None:  # noqa: ARG002
         """Return to the neutral state; situation and seed mean nothing to a network."""
         self._network.reset()
 

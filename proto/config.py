@@ -5,32 +5,84 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import ErrorDetails
 
 from proto.errors import UserError
-from proto.seeds import TRIALS_BELOW
+from proto.seeds import SEEDS_PER_CASE, TRIALS_BELOW
 from proto.storage import written_whole
+from proto.strict_yaml import WrittenFloat, WrittenInt, dump_yaml, load_yaml
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
+# Strict: a text or a truth value is never taken for a number.
+Switch = Annotated[bool, Field(strict=True)]
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+TimeConstant = Annotated[float, Field(strict=True, ge=1)]
+Natural = Annotated[int, Field(strict=True, ge=0)]
+Count = Annotated[int, Field(strict=True, ge=1)]
+AtLeastTwo = Annotated[int, Field(strict=True, ge=2)]
+
+
+def _check_repeats(repeats: int) -> int:
+    if repeats > SEEDS_PER_CASE:
+        raise ValueError(
+            f"must not exceed {SEEDS_PER_CASE}: a case has so many seeds, one for each repeat"
+        )
+    return repeats
+
+
+Repeats = Annotated[Count, AfterValidator(_check_repeats)]
+
+
+def _expand_home(folder: Path) -> Path:
+    try:
+        return folder.expanduser()
+    except RuntimeError as error:
+        raise ValueError(f"~ cannot be expanded: {error}") from error
 
 
 class _Section(BaseModel):
+    """A part of the configuration; in YAML an empty section means all defaults."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_written(cls, values: Any) -> Any:
+        """Accept an empty section, and numbers as texts, such as `name: 007`, as they stand."""
+        if values is None:
+            return {}
+        if not isinstance(values, dict):
+            return values
+        texts = {
+            name for name, field in cls.model_fields.items() if field.annotation in (str, Path)
+        }
+        return {
+            name: value.text
+            if name in texts and isinstance(value, WrittenInt | WrittenFloat)
+            else value
+            for name, value in values.items()
+        }
 
 
 class RunConfig(_Section):
-    """The run: a folder with its config, checkpoints, tutoring, rollouts, evaluation and logs."""
+    """Name and folder of the run, and the seed of everything random in its training."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = "experiment1"
-    folder: Path = Path("runs")
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    folder: Annotated[Path, AfterValidator(_expand_home)] = Path("runs")
+    seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 1
 
 
 class HubConfig(_Section):
@@ -39,31 +91,45 @@ class HubConfig(_Section):
     endpoint: Annotated[str, Field(pattern=r"^(tcp|tls|udp|quic|ws)/.+:\d+$")] = (
         "tcp/127.0.0.1:7447"
     )
-    shared_memory: bool = False
+    shared_memory: Switch = False
 
 
-TaskName = Literal["experiment1", "reaching"]
-"""Experiment I, or the same without an obstacle, which the vision is pre-trained on."""
+TaskName = Annotated[str, Field(min_length=1, max_length=200)]
+"""A built-in task, or one of the user's own as `package.module:Class`."""
 
 
 Attention = Literal["active", "fixed"]
-"""Whether the robot turns its head and focuses, or keeps both as they are at the start."""
+"""Whether the robot moves its head and its focus, or keeps both as they are at the start."""
 
 
 class TaskConfig(_Section):
-    """Which task is tutored and tested, and whether gaze and focus have a part in it."""
+    """Which task is tutored and tested, and whether gaze and focus have a part in it.
+
+    Attributes:
+        name: a task of `actors.tasks.registry`, or one's own as `package.module:Class`.
+        attention: whether the robot turns its head and focuses.
+
+    A task may have options of its own; it checks them itself, see `options`.
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
 
     name: TaskName = "experiment1"
     attention: Attention = "active"
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """What the section holds besides the keys above."""
+        return dict(self.model_extra or {})
+
 
 class SimulatorConfig(_Section):
-    """Which simulator plays the scenes, and how finely."""
+    """Which simulator plays the scenes, and with which time steps."""
 
     backend: str = "sapien"
     control_period_s: Positive = 0.1
     physics_period_s: Positive = 0.005
-    render: bool = True
+    render: Switch = True
 
     @property
     def substeps(self) -> int:
@@ -81,25 +147,26 @@ class ActorConfig(_Section):
     """What actors do besides tutoring and trials.
 
     Attributes:
-        practice: play situations of one's own when nothing is asked for.
-        live: publish each step while anyone watches.
+        practice: play random situations when nothing is asked for.
+        live: publish each control step while anyone subscribes to it.
     """
 
-    practice: bool = True
-    live: bool = True
+    practice: Switch = True
+    live: Switch = True
 
 
 class TutorConfig(_Section):
     """How the tutor executes its plan when a case is tutored again, and how it guides a policy.
 
     Attributes:
-        repeats: executions of each case, the first of them clean.
+        repeats: executions of each case; the first has no noise.
         noise_deg: amplitude of the execution noise.
         noise_correlation_steps: over how many control steps it is correlated.
-        guidance_deg: in a correction, how far neck and arm may be told to be from the clean plan.
+        guidance_deg: in a correction, how far the actions of neck and arm may be from the clean
+            plan.
     """
 
-    repeats: Count = 4
+    repeats: Repeats = 4
     noise_deg: NotNegative = 1.0
     noise_correlation_steps: Positive = 20.0
     guidance_deg: NotNegative = 5.0
@@ -109,7 +176,7 @@ class SubnetConfig(_Section):
     """A subnet of leaky integrators without space (PFC, M_S, M_F)."""
 
     units: Count
-    tau: Annotated[float, Field(ge=1)]
+    tau: TimeConstant
 
 
 class MapsConfig(_Section):
@@ -118,7 +185,7 @@ class MapsConfig(_Section):
     maps: Count
     kernel: tuple[Count, Count]
     stride: Count
-    tau: Annotated[float, Field(ge=1)]
+    tau: TimeConstant
 
 
 class NetworkConfig(_Section):
@@ -129,18 +196,18 @@ class NetworkConfig(_Section):
     pfc: SubnetConfig = SubnetConfig(units=20, tau=150)
     mtrnn_slow: SubnetConfig = SubnetConfig(units=30, tau=10)
     mtrnn_fast: SubnetConfig = SubnetConfig(units=50, tau=2)
-    softmax_units: Annotated[int, Field(ge=2)] = 10
+    softmax_units: AtLeastTwo = 10
     code_margin: NotNegative = 0.2
     code_width: Positive = 0.6
     update_order: Literal["bottom_up", "literal"] = "bottom_up"
 
     @model_validator(mode="before")
     @classmethod
-    def _rest_is_the_papers(cls, values: Any) -> Any:
-        """Let a config name only what differs, such as `pfc: {tau: 30}`."""
+    def _complete_subnets(cls, values: Any) -> Any:
+        """Take what is not given of a subnet from the paper: `pfc: {tau: 30}` gives no units."""
         if not isinstance(values, dict):
             return values
-        given = {name: value for name, value in values.items() if isinstance(value, dict)}
+        given = {n: value or {} for n, value in values.items() if isinstance(value, dict | None)}
         defaults = {
             name: field.default.model_dump()
             for name, field in cls.model_fields.items()
@@ -155,26 +222,20 @@ class PretrainingConfig(_Section):
     On the bus the learner first asks the actors for the sequences of pre-training: each of `cases`
     (indices of the tutored cases of `task`, None for all) `repeats` times. It starts with
     `start_sequences` of them, or with all if they are fewer. Without a task of its own, and in
-    `vmdnn train` without --pretraining-data, the sequences of coupled training serve.
+    `vmdnn train` without --pretraining-data, the sequences of coupled training serve. What is asked
+    about them is the task's to say.
     """
 
-    task: Literal["reaching"] | None = "reaching"
-    cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
-    repeats: Count = 4
+    task: TaskName | None = None
+    cases: tuple[Natural, ...] | None = None
+    repeats: Repeats = 4
     start_sequences: Count = 60
-    epochs: Annotated[int, Field(ge=0)] = 30
+    epochs: Natural = 30
     rate: Positive = 2e-3
     batch: Count = 15
-    # values of the situation that are asked for, and in how many classes
-    labels: Annotated[dict[str, Annotated[int, Field(ge=2)]], Field(min_length=1)] = {
-        "object_y_m": 3,
-        "object_yaw_deg": 5,
-    }
-    # last part of a sequence in which the answer is asked for
-    answer_part: Annotated[float, Field(gt=0, le=1)] = 0.25
     # disturbance of the pictures, another one for each sequence and epoch: largest shift in pixels,
     # standard deviations of contrast and brightness, and of each pixel (brightness is -1..1)
-    image_shift: Annotated[int, Field(ge=0)] = 3
+    image_shift: Natural = 3
     image_gain: NotNegative = 0.05
     image_noise: NotNegative = 0.03
 
@@ -183,19 +244,19 @@ class CorrectionsConfig(_Section):
     """Tutoring that goes on when coupled training is over, on the bus only.
 
     In each round the tutor guides the newest policy in some situations (see
-    `TutorConfig.guidance_deg`). Then training goes on with all sequences: so many epochs with a
-    warm-up and a schedule of their own, and a policy at their end.
+    `TutorConfig.guidance_deg`). Then training goes on with all sequences for some epochs, which
+    have a warm-up and a schedule of their own and end with a policy.
 
     Attributes:
         rounds: number of rounds.
-        choose: in which situations: those in which the newest policy was not precise in practice
+        choose: the situations: those in which the newest policy was not precise in practice
             (`failures`), random ones, or the tutored cases in their order.
-        sequences: corrections of a round; fewer if there are not as many tutored cases.
-        tries: among failures, no more are looked for once so many episodes of practice were judged.
+        sequences: corrections of a round; fewer if there are fewer tutored cases.
+        tries: episodes of practice that are judged in a round to find failures.
         epochs: epochs after each round.
     """
 
-    rounds: Annotated[int, Field(ge=0)] = 0
+    rounds: Natural = 0
     choose: Literal["failures", "random", "tutored"] = "failures"
     sequences: Count = 45
     tries: Count = 200
@@ -212,13 +273,13 @@ class LearnerConfig(_Section):
     the rounds of `corrections`, each with a policy at its end.
     """
 
-    cases: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    cases: tuple[Natural, ...] | None = None
     lease_s: Positive = 60.0
     start_sequences: Count = 45
     epochs: Count = 400
     rate: Positive = 3e-3
     schedule: Literal["constant", "cosine"] = "cosine"
-    warmup_epochs: Annotated[int, Field(ge=0)] = 12
+    warmup_epochs: Natural = 12
     batch: Count = 30
     clip_norm: Positive | None = 1.0
     # in coupled training: disturbance of each unit of V_S, another one for each sequence and epoch,
@@ -226,7 +287,7 @@ class LearnerConfig(_Section):
     vision_noise: NotNegative = 0.3
     # share of the sequences in whose place one between tutored situations is learned, guessed from
     # the sequences around it
-    interpolation: Annotated[float, Field(ge=0, le=1)] = 0.7
+    interpolation: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.7
     initial_range: Positive = 0.1
     initial_range_pfc_input: Positive = 0.2
     checkpoint_every_epochs: Count = 50
@@ -237,7 +298,7 @@ class LearnerConfig(_Section):
 
 
 RivalKind = Literal["cnn-lstm", "feed-forward"]
-"""Networks of other kinds, which VMDNN is compared with."""
+"""Networks of other kinds that VMDNN is compared with."""
 
 
 class RivalConfig(_Section):
@@ -260,7 +321,7 @@ class RivalConfig(_Section):
     together_epochs: Count = 60
     epochs: Count = 600
     rate: Positive = 3e-3
-    image_shift: Annotated[int, Field(ge=0)] = 2
+    image_shift: Natural = 2
     image_gain: NotNegative = 0.05
     image_noise: NotNegative = 0.03
 
@@ -287,24 +348,25 @@ class ComparisonConfig(_Section):
 class EvaluatorConfig(_Section):
     """Trials of unlearned situations, counted for each policy version."""
 
-    trials_per_policy: Annotated[int, Field(ge=1, le=2**28)] = 52
-    # the last trial's seed is so below all those that may be tutored
-    seed: Annotated[int, Field(ge=0, le=TRIALS_BELOW - 2**28)] = 1000
+    trials_per_policy: Annotated[int, Field(strict=True, ge=1, le=2**28)] = 52
+    # so that the seeds of all trials are below those of corrections and practice
+    seed: Annotated[int, Field(strict=True, ge=0, le=TRIALS_BELOW - 2**28)] = 1000
     lease_s: Positive = 60.0
 
 
 class RecorderConfig(_Section):
-    """What is kept of the rollouts on disk: all of them, or only those that are trials."""
+    """Which rollouts are recorded: all of them, or only trials."""
 
-    practice: bool = True
+    practice: Switch = True
 
 
 class DoneConfig(_Section):
-    """When a run started by deploy/run_local.sh is finished; with neither condition, never.
+    """When a run started by deploy/run_local.sh is finished; without conditions it never is.
 
     Attributes:
-        policy_versions: so many policy versions were published.
-        trials: the newest policy version, and it is at least that one, has so many trials counted.
+        policy_versions: number of policy versions to publish.
+        trials: number of trials to count of the newest policy version, which must be at least
+            `policy_versions`.
     """
 
     policy_versions: Count | None = None
@@ -317,7 +379,7 @@ class DoneConfig(_Section):
 
 
 class Config(_Section):
-    """Everything a run depends on."""
+    """The configuration of a run."""
 
     run: RunConfig = RunConfig()
     hub: HubConfig = HubConfig()
@@ -338,10 +400,16 @@ class Config(_Section):
         return self.run.folder / self.run.name
 
     @property
-    def pretraining_task(self) -> TaskName | None:
-        """Task of the sequences of pre-training; None where those of coupled training serve."""
+    def pretraining_task(self) -> str | None:
+        """Task of the sequences of pre-training; None if it uses those of coupled training."""
         first = self.learner.pretraining
         return None if first.epochs == 0 or first.task == self.task.name else first.task
+
+    def task_called(self, name: str) -> TaskConfig:
+        """The section `task` for another task, of which it knows no options."""
+        if name == self.task.name:
+            return self.task
+        return TaskConfig(name=name, attention=self.task.attention)
 
     @model_validator(mode="after")
     def _can_find_failures(self) -> Self:
@@ -357,10 +425,7 @@ class Config(_Section):
         return self
 
     def digest(self) -> str:
-        """Twelve hexadecimal digits that tell one effective configuration from another.
-
-        Where the hub and the folder are makes no difference.
-        """
+        """Twelve hexadecimal digits over all values, except the hub's and the run's folder."""
         values = self.model_dump(mode="json", exclude={"hub": True, "run": {"folder"}})
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -372,7 +437,7 @@ class Config(_Section):
             UserError: it cannot be written there.
         """
         with written_whole(path) as stream:
-            stream.write(yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False).encode())
+            stream.write(dump_yaml(self.model_dump(mode="json")).encode())
 
 
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
@@ -381,16 +446,7 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     Raises:
         UserError: missing file, broken YAML, unknown key, wrong type or value out of range.
     """
-    values: dict[str, Any] = {}
-    if path is not None:
-        try:
-            values = yaml.safe_load(path.read_text()) or {}
-        except FileNotFoundError as error:
-            raise UserError(f"config file {path} does not exist") from error
-        except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-            raise UserError(f"config file {path} cannot be read: {error}") from error
-        if not isinstance(values, dict):
-            raise UserError(f"config file {path}: expected `section: ...` lines at the top level")
+    values = {} if path is None else _read(path)
     for override in overrides:
         _apply(values, override)
     try:
@@ -398,16 +454,46 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     except ValidationError as error:
         where = f"config file {path}" if path else "config"
         problems = "\n".join(
-            f"  {'.'.join(str(part) for part in problem['loc'])}: {_what_is_wrong(problem)}"
-            for problem in error.errors()
+            f"  {_key_of(problem)}: {_what_is_wrong(problem)}" for problem in error.errors()
         )
         raise UserError(f"{where} is not valid:\n{problems}") from error
 
 
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        values = load_yaml(path.read_text())
+    except FileNotFoundError as error:
+        raise UserError(f"config file {path} does not exist") from error
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise UserError(f"config file {path} cannot be read: {error}") from error
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise UserError(f"config file {path}: expected `section: ...` lines at the top level")
+    return values
+
+
+def _key_of(problem: ErrorDetails) -> str:
+    return ".".join(str(part) for part in problem["loc"])
+
+
 def _what_is_wrong(problem: ErrorDetails) -> str:
     if problem["type"] == "extra_forbidden":
-        return "there is no such key; proto/config.py lists those there are"
-    return f"{problem['msg']} (got {problem['input']!r})"
+        similar = get_close_matches(_key_of(problem), _keys_of(Config), n=1)
+        advice = f"did you mean {similar[0]}?" if similar else "proto/config.py lists all keys"
+        return f"there is no such key; {advice}"
+    return f"{problem['msg'].removeprefix('Value error, ')} (got {problem['input']!r})"
+
+
+def _keys_of(section: type[BaseModel], prefix: str = "") -> list[str]:
+    """All keys of a section, such as `learner` and `learner.rate`."""
+    keys = []
+    for name, field in section.model_fields.items():
+        keys.append(f"{prefix}{name}")
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            keys += _keys_of(kind, f"{prefix}{name}.")
+    return keys
 
 
 def _apply(values: dict[str, Any], override: str) -> None:
@@ -416,11 +502,12 @@ def _apply(values: dict[str, Any], override: str) -> None:
         raise UserError(f"--set {override!r}: expected key=value, such as learner.rate=1e-3")
     *sections, last = key.split(".")
     for section in sections:
-        inner = values.setdefault(section, {})
-        if not isinstance(inner, dict):
+        if values.get(section) is None:
+            values[section] = {}
+        if not isinstance(values[section], dict):
             raise UserError(f"--set {override!r}: {section} is a value, not a section")
-        values = inner
+        values = values[section]
     try:
-        values[last] = yaml.safe_load(text)
+        values[last] = load_yaml(text)
     except yaml.YAMLError as error:
-        raise UserError(f"--set {override!r}: {text!r} is not a YAML value") from error
+        raise UserError(f"--set {override!r}: {text!r} is not a YAML value: {error}") from error

@@ -1,4 +1,4 @@
-"""What must arrive: kept on disk until its receipt comes, and sent again until then."""
+"""Messages that must arrive: kept on disk until the receiver answers, and sent again until then."""
 
 from __future__ import annotations
 
@@ -7,77 +7,166 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from proto.codec import Wire
+from proto.errors import UserError
+from proto.storage import change_suffix, make_folder, parts_in, written_whole
 
 LOG = logging.getLogger(__name__)
 
 RESEND_AFTER_S: Final = 5.0
+"""Time to wait for the answer to a message; it doubles each time that none comes."""
+RESEND_AFTER_AT_MOST_S: Final = 30.0
 IN_FLIGHT: Final = 8
-"""So many of the oldest are sent without a receipt; the others wait their turn."""
+"""Messages that wait for an answer at the same time; each waits for RESEND_AFTER_S at most."""
+
+PUT_ASIDE: Final = (".refused", ".damaged")
+"""File suffixes of messages that are kept but not sent any more."""
 
 Send = Callable[[str, Wire], None]
 
 
 @dataclass
 class _Entry:
+    """A message without an answer.
+
+    Attributes:
+        path: its file.
+        sends: how often it was sent.
+        sent_at_s: when it was sent last (monotonic clock).
+    """
+
     path: Path
-    sent_at_s: float = field(default=float("-inf"))
+    sends: int = 0
+    sent_at_s: float = float("-inf")
 
 
 class Outbox:
-    """Messages on their way, one file each; those of a former process are found again.
+    """Messages without an answer, one file each; those of a former process are found again.
 
-    A file is one line of JSON with key and encoding, and the payload after it.
+    A receiver answers with a receipt, or with a refusal, which is final: a refused message is kept
+    in a file with the suffix `.refused` and not sent again. A message without an answer is sent
+    again, later each time; the first answer after a long silence makes all messages due at once.
+    Messages that were sent least often go first, the oldest of them first: messages that nobody
+    answers, such as those of another version, do not hold up the others.
+
+    A file is one line of JSON with key and encoding, followed by the payload. Used by several
+    threads.
     """
 
-    def __init__(self, folder: Path, send: Send, *, resend_after_s: float = RESEND_AFTER_S) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        send: Send,
+        *,
+        resend_after_s: float = RESEND_AFTER_S,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Find the messages in a folder.
+
+        Args:
+            folder: where the messages are kept; it is made if it is missing. No other process may
+                use it.
+            send: sends a message under a key.
+            resend_after_s: time to wait for the first answer.
+            clock: gives the time in seconds.
+
+        Raises:
+            UserError: the folder cannot be made.
+        """
+        make_folder(folder)
+        for unfinished in parts_in(folder):
+            unfinished.unlink()
         self._folder = folder
         self._send = send
         self._resend_after_s = resend_after_s
+        self._at_most_s = max(RESEND_AFTER_AT_MOST_S, resend_after_s)
+        self._clock = clock
         self._lock = threading.Lock()
-        folder.mkdir(parents=True, exist_ok=True)
+        self._last_answer_s = clock()
         self._entries = {
             path.stem.partition("-")[2]: _Entry(path) for path in sorted(folder.glob("*.message"))
         }
+        self._put_aside = sum(path.suffix in PUT_ASIDE for path in folder.iterdir())
 
     def __len__(self) -> int:
         return len(self._entries)
 
+    @property
+    def put_aside(self) -> int:
+        """Number of messages that are kept but not sent any more: refused or damaged ones."""
+        return self._put_aside
+
     def add(self, name: str, key: str, wire: Wire) -> None:
-        """Keep a message and send it; `name` is what its receipt will say."""
+        """Keep a message and send it.
+
+        Args:
+            name: the name by which the receiver's answer refers to the message.
+            key: where it is sent.
+            wire: the message.
+
+        Raises:
+            UserError: it cannot be written; then it is not sent.
+        """
         path = self._folder / f"{time.time_ns()}-{name}.message"
-        unfinished = path.with_suffix(".unfinished")
         header = json.dumps({"key": key, "encoding": wire.encoding}).encode()
-        unfinished.write_bytes(header + b"\n" + wire.payload)
-        unfinished.rename(path)
+        with written_whole(path) as stream:
+            stream.write(header + b"\n" + wire.payload)
         with self._lock:
             self._entries[name] = _Entry(path)
         self.send_due()
 
     def received(self, name: str) -> None:
-        """The receipt of `name` has come; one that is not known is no matter."""
-        with self._lock:
-            entry = self._entries.pop(name, None)
+        """Delete a message whose receipt has come. Unknown names are ignored."""
+        entry = self._answered(name)
         if entry is not None:
             entry.path.unlink(missing_ok=True)
 
+    def refused(self, name: str, reason: str) -> None:
+        """Put a message aside that the receiver will never take. Unknown names are ignored."""
+        entry = self._answered(name)
+        if entry is not None:
+            self._set_aside(entry.path, ".refused", f"was refused: {reason}")
+
     def send_due(self) -> None:
-        """Send what was not sent yet, or so long ago that its receipt should have come."""
-        now = time.monotonic()
+        """Send what was not sent yet, and again what should have been answered by now."""
+        for name, entry in self._take_due():
+            self._send_one(name, entry)
+
+    def _take_due(self) -> list[tuple[str, _Entry]]:
+        """Choose the messages to send now and note that they are sent."""
+        now_s = self._clock()
         with self._lock:
+            waiting = [(now_s - entry.sent_at_s, entry) for entry in self._entries.values()]
+            in_flight = sum(waited_s < self._resend_after_s for waited_s, _ in waiting)
             due = [
                 (name, entry)
-                for name, entry in list(self._entries.items())[:IN_FLIGHT]
-                if now - entry.sent_at_s >= self._resend_after_s
+                for name, entry in self._entries.items()
+                if now_s - entry.sent_at_s >= self._patience_s(entry)
             ]
-            for _, entry in due:
-                entry.sent_at_s = now
-        for name, entry in due:
-            self._send_one(name, entry)
+            due.sort(key=lambda item: item[1].sends)  # a stable sort: the oldest stay first
+            chosen = due[: max(0, IN_FLIGHT - in_flight)]
+            for _, entry in chosen:
+                entry.sent_at_s = now_s
+                entry.sends += 1
+        return chosen
+
+    def _patience_s(self, entry: _Entry) -> float:
+        """How long to wait for an answer after the last time that a message was sent."""
+        return min(self._resend_after_s * 2.0 ** max(entry.sends - 1, 0), self._at_most_s)
+
+    def _answered(self, name: str) -> _Entry | None:
+        """Take a message out whose answer has come."""
+        with self._lock:
+            now_s = self._clock()
+            if now_s - self._last_answer_s >= self._at_most_s:  # the receiver was away
+                for entry in self._entries.values():
+                    entry.sent_at_s = float("-inf")
+            self._last_answer_s = now_s
+            return self._entries.pop(name, None)
 
     def _send_one(self, name: str, entry: _Entry) -> None:
         try:
@@ -85,9 +174,18 @@ class Outbox:
             values = json.loads(header)
             self._send(values["key"], Wire(values["encoding"], payload))
         except FileNotFoundError:
-            pass  # its receipt came in between
+            pass  # its answer came in between
         except (ValueError, KeyError, TypeError) as error:
-            LOG.warning("%s is damaged (%s): put aside", entry.path, error)
-            entry.path.rename(entry.path.with_suffix(".damaged"))
             with self._lock:
                 self._entries.pop(name, None)
+            self._set_aside(entry.path, ".damaged", f"is damaged ({error})")
+
+    def _set_aside(self, path: Path, suffix: str, problem: str) -> None:
+        try:
+            aside = change_suffix(path, suffix)
+        except UserError as error:
+            LOG.warning("%s %s, but cannot be put aside: %s", path, problem, error)
+            return
+        with self._lock:
+            self._put_aside += 1
+        LOG.warning("a message %s; it is kept in %s and not sent again", problem, aside)

@@ -7,19 +7,20 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
 from typing import Final, Protocol, cast
 
 from proto.errors import UserError
 
 
 class Command(Protocol):
-    """A module with one subcommand."""
+    """A module that is a subcommand."""
 
     def configure(self, parser: argparse.ArgumentParser) -> None:
         """Add the subcommand's arguments."""
 
     def run(self, arguments: argparse.Namespace) -> int:
-        """Do it; the result is the exit status."""
+        """Run the subcommand; gives the exit status."""
 
 
 # Each module is imported only when its subcommand is asked for: `vmdnn hub` needs no torch.
@@ -29,7 +30,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "actor": ("services.commands.actor", "play scenes with the newest policy"),
     "evaluator": ("services.commands.evaluator", "hand out trials and count success"),
     "recorder": ("services.commands.recorder", "record every episode as MCAP"),
-    "watch": ("services.commands.watch", "see what all processes are doing"),
+    "watch": ("services.commands.watch", "show what all processes are doing"),
+    "control": ("services.commands.control", "pause, resume or stop processes of a run"),
     "tutor": ("services.commands.tutor", "record tutoring sequences, without the bus"),
     "train": ("services.commands.train", "train a network on recorded sequences"),
     "evaluate": ("services.commands.evaluate", "test a policy on unlearned situations"),
@@ -44,7 +46,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one subcommand and return its exit status; bad input prints a message and gives 2."""
+    """Run one subcommand; gives its exit status, 2 for bad input, which is explained."""
     _use_one_thread()
     parser = argparse.ArgumentParser(
         prog="vmdnn",
@@ -52,6 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         epilog="`vmdnn COMMAND --help` explains a command.",
     )
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    parser.add_argument("--version", action="version", version=f"%(prog)s {version('vmdnn')}")
     words = list(sys.argv[1:] if argv is None else argv)
     asked = next((word for word in words if not word.startswith("-")), None)
     for name, (module, summary) in COMMANDS.items():
@@ -73,16 +76,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # who reads the output, such as `head`, has seen enough
+    except BrokenPipeError:  # the reader of the output, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
 
 
 def _use_one_thread() -> None:
-    """Keep numpy from starting a thread for each core, before anything imports it.
+    """Keep numpy from starting a thread for each core; must run before numpy is imported.
 
-    Its products here are small; with many processes on a few cores such threads cost more than ten
-    times what they save. The learner sets the number of its threads itself.
+    The matrix products here are small: with many processes on a few cores such threads cost more
+    than ten times what they save. The learner sets the number of its threads itself.
     """
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")

@@ -5,34 +5,33 @@ from __future__ import annotations
 import logging
 import time
 
-from proto.bus import open_hub
+from proto.bus import Bus
 from proto.config import Config
-from proto.membership import Lifecycle, membership
+from proto.lifecycle import Lifecycle
+from proto.membership import membership
 from proto.metrics import HubMetrics
 
 LOG = logging.getLogger(__name__)
 
 
 class Hub:
-    """Passes on what the processes say; it keeps nothing, so it may be restarted at any time."""
+    """Forwards messages between the processes. It stores nothing, so it may restart at any time."""
 
-    def __init__(self, config: Config, process: str) -> None:
-        """Listen at the configured endpoint.
+    def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
+        """Make a hub on a bus that `open_hub` opened: that session is the router."""
+        self._endpoint = config.hub.endpoint
+        self._bus = bus
+        self._lifecycle = lifecycle
 
-        Raises:
-            UserError: it cannot listen there.
-        """
-        self._bus = open_hub(config.hub, config.run.name, process)
-        LOG.info("listening at %s", config.hub.endpoint)
-
-    def run(self, lifecycle: Lifecycle) -> None:
+    def run(self) -> None:
         """Serve until it should stop."""
-        with self._bus, membership(self._bus, self, lifecycle):
-            while not lifecycle.stopping:
-                lifecycle.wait(1.0)
+        LOG.info("listening at %s", self._endpoint)
+        with membership(self._bus, self, self._lifecycle):
+            while not self._lifecycle.stopping:
+                self._lifecycle.wait(1.0)
 
     def metrics(self) -> HubMetrics:
-        """What it tells about itself."""
+        """Metrics at this moment."""
         return HubMetrics(
             id=self._bus.id,
             time_s=time.time(),
@@ -41,5 +40,5 @@ class Hub:
         )
 
     def checkpoint(self) -> str:
-        """It has nothing to keep."""
-        return "a hub keeps nothing"
+        """Write nothing: a hub stores nothing."""
+        return "a hub stores nothing"

@@ -16,6 +16,8 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
+from proto.cache import cache_folder
+
 FOLDER: Final = Path(__file__).parent
 SOURCES: Final = ("core.cpp", "adam.cpp", "mixing.cpp", "maps.cpp", "acting.cpp")
 HEADERS: Final = ("vectors.h", "lanes.h", "threads.h")
@@ -47,11 +49,6 @@ def find_or_compile() -> Path:
         if library.is_file():
             return library
     return compile_into(cache_folder())
-
-
-def cache_folder() -> Path:
-    """`$VMDNN_CACHE`, or `~/.cache/vmdnn`."""
-    return Path(os.environ.get("VMDNN_CACHE") or Path.home() / ".cache" / "vmdnn")
 
 
 def library_name() -> str:

@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from learner.checkpoint import CLASSIFIER_PREFIX, NETWORK_PREFIX, Checkpoint
+from learner.checkpoint import CLASSIFIER_PREFIX, NETWORK_PREFIX, Checkpoint, Classes
 from learner.network.mtrnn import run_levels
 from learner.network.vision_input import vision_input
 from learner.network.vmdnn import VMDNN
 from learner.tensors import to_tensors
-from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.episode import Episode
 from proto.errors import UserError
+from proto.variables import number_of
 
 Array = NDArray[np.float64]
 
@@ -32,19 +32,20 @@ PENALTIES: Final = np.logspace(-7, 1, 17)
 
 @dataclass(frozen=True)
 class ClassifierScore:
-    """How well the classifier read a value at the end of each sequence.
+    """How well the classifier read a variable, at the end of the window of its question.
 
     Attributes:
-        value: name of the situation's value.
+        value: name of the variable.
         classes: how many there are.
         right: fraction of sequences for which the nearest class got the highest probability.
-        error: mean distance of the value from the mean of the classes under the probabilities.
+        error: mean distance of the value from the mean of the classes under the probabilities; None
+            for a discrete variable.
     """
 
     value: str
     classes: int
     right: float
-    error: float
+    error: float | None
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,13 @@ class RegressionScore:
     """How well a regression from V_S at the end of a phase predicts a value of other sequences.
 
     Attributes:
-        phase: number of the phase.
-        value: name of the situation's value.
+        phase: name of the phase.
+        value: name of the variable.
         error: mean distance of the prediction from the value.
         blind_error: the same for a prediction without vision, the mean of the learned sequences.
     """
 
-    phase: int
+    phase: str
     value: str
     error: float
     blind_error: float
@@ -68,62 +69,62 @@ class Vision:
     """V_F and V_S of a checkpoint and, if it is from pre-training, its classifier.
 
     Attributes:
-        classes: centres of the classifier's classes by value; empty without a classifier.
+        asked: what the classifier was asked, by name of the variable; empty without a classifier.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
         training = checkpoint.metadata.training
-        self.classes = {} if training is None else training.classes
+        self.asked = {} if training is None else training.asked
         self._network = VMDNN(checkpoint.metadata.network)
         self._network.load_state_dict(to_tensors(checkpoint.part(NETWORK_PREFIX)))
         self._classifier = to_tensors(checkpoint.part(CLASSIFIER_PREFIX))
 
     @torch.no_grad()
     def see(self, episode: Episode) -> NDArray[np.float32]:
-        """V_S (T, units) in an episode.
-
-        Raises:
-            UserError: its pictures are of another size than the network's.
-        """
-        if episode.images.shape[1:] != (IMAGE_HEIGHT, IMAGE_WIDTH):
-            raise UserError(
-                f"{episode.id} has images {episode.images.shape[1:]}, but the network looks at"
-                f" {IMAGE_HEIGHT, IMAGE_WIDTH} (height, width)"
-            )
+        """V_S (T, units) in an episode."""
         images = torch.from_numpy(vision_input(episode.images))
         return np.asarray(self._network.see(images[None])[0])
 
     @torch.no_grad()
     def classify(self, seen: NDArray[np.float32]) -> dict[str, Array]:
-        """Probabilities of the classes of each value, at the end of V_S (T, units)."""
-        pfc = run_levels([self._network.pfc], torch.from_numpy(seen)[None], "bottom_up")[0, -1]
-        sums = self._classifier["weight"] @ pfc + self._classifier["bias"]
-        parts = torch.split(sums, [len(centres) for centres in self.classes.values()])
-        return {
-            value: np.asarray(torch.softmax(part.double(), dim=0))
-            for value, part in zip(self.classes, parts, strict=True)
-        }
+        """Probabilities of the classes of each variable for V_S (T, units), by its name.
+
+        They are those at the end of the window in which the variable is asked for.
+        """
+        pfc = run_levels([self._network.pfc], torch.from_numpy(seen)[None], "bottom_up")[0]
+        sums = pfc @ self._classifier["weight"].T + self._classifier["bias"]
+        parts = torch.split(sums, [len(each.classes) for each in self.asked.values()], dim=1)
+        probabilities = {}
+        for (name, each), part in zip(self.asked.items(), parts, strict=True):
+            last = max(int(len(seen) * each.window[1]) - 1, 0)
+            probabilities[name] = np.asarray(torch.softmax(part[last].double(), dim=0))
+        return probabilities
 
 
 def score_classifier(vision: Vision, episodes: Sequence[Episode]) -> list[ClassifierScore]:
-    """How well the classifier reads each value; empty without a classifier."""
-    if not vision.classes:
+    """How well the classifier reads each variable; empty without a classifier."""
+    if not vision.asked:
         return []
     probabilities = [vision.classify(vision.see(episode)) for episode in episodes]
-    scores = []
-    for value, centres in vision.classes.items():
-        truth = _values(episodes, value)[:, None]
-        shares = np.stack([each[value] for each in probabilities])
-        nearest = np.abs(truth - centres).argmin(1)
-        scores.append(
-            ClassifierScore(
-                value=value,
-                classes=len(centres),
-                right=float((shares.argmax(1) == nearest).mean()),
-                error=float(np.abs(shares @ np.array(centres) - truth[:, 0]).mean()),
-            )
-        )
-    return scores
+    return [
+        _score(name, asked.classes, np.stack([each[name] for each in probabilities]), episodes)
+        for name, asked in vision.asked.items()
+    ]
+
+
+def _score(
+    name: str, classes: Classes, shares: Array, episodes: Sequence[Episode]
+) -> ClassifierScore:
+    """The score of probabilities (N, classes) of a variable's classes in N episodes."""
+    answers = shares.argmax(1)
+    if isinstance(classes[0], str):
+        truth = [classes.index(str(episode.situation[name])) for episode in episodes]
+        right = float(np.mean(answers == np.array(truth)))
+        return ClassifierScore(name, len(classes), right, error=None)
+    centres, values = np.asarray(classes, np.float64), _values(episodes, name)
+    nearest = np.abs(values[:, None] - centres).argmin(1)
+    error = float(np.abs(shares @ centres - values).mean())
+    return ClassifierScore(name, len(classes), float((answers == nearest).mean()), error)
 
 
 def score_regression(
@@ -137,8 +138,8 @@ def score_regression(
         tested: sequences that it is tested on.
 
     Returns:
-        Scores by phase and value. Values that are the same in all of `learned`, or missing in some
-        episode, are left out.
+        Scores by phase and variable. Discrete variables are left out, and those that are the same
+        in all of `learned` or missing in some episode.
 
     Raises:
         UserError: no value is left, or no phase occurs in all episodes.
@@ -146,7 +147,8 @@ def score_regression(
     values = _common_values([*learned, *tested])
     values = [value for value in values if np.ptp(_values(learned, value)) > 0]
     seen, seen_tested = (_at_ends(vision, episodes) for episodes in (learned, tested))
-    phases = sorted(set.intersection(*(set(ends) for ends in (*seen, *seen_tested))))
+    shared = set.intersection(*(set(ends) for ends in (*seen, *seen_tested)))
+    phases = [phase for phase in seen[0] if phase in shared]
     if not values or not phases:
         raise UserError("the sequences have no phase, or no varying value, in common")
     scores = []
@@ -196,20 +198,21 @@ def _left_out_error(smoother: Array, values: Array) -> float:
     return float(np.square(np.concatenate(left_out)).sum())
 
 
-def _at_ends(vision: Vision, episodes: Sequence[Episode]) -> list[dict[int, NDArray[np.float32]]]:
+def _at_ends(vision: Vision, episodes: Sequence[Episode]) -> list[dict[str, NDArray[np.float32]]]:
     """V_S (units,) at the last step of each phase, for each episode."""
     found = []
     for episode in episodes:
         seen = vision.see(episode)
         ends = np.flatnonzero(np.diff(episode.phases.astype(int), append=-1))
-        found.append({int(episode.phases[end]): seen[end] for end in ends})
+        found.append({episode.phase_names[episode.phases[end]]: seen[end] for end in ends})
     return found
 
 
 def _common_values(episodes: Sequence[Episode]) -> list[str]:
     common = set.intersection(*(set(episode.situation) for episode in episodes))
-    return [value for value in episodes[0].situation if value in common]
+    situation = episodes[0].situation
+    return [name for name in situation if name in common and not isinstance(situation[name], str)]
 
 
 def _values(episodes: Sequence[Episode], value: str) -> Array:
-    return np.array([episode.situation[value] for episode in episodes])
+    return np.array([number_of(episode.situation, value) for episode in episodes])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -14,6 +12,7 @@ from learner.rivals.networks import State, make_rival
 from learner.tensors import to_tensors
 from proto.episode import Image
 from proto.errors import UserError
+from proto.variables import Situation
 
 
 class RivalPolicy:
@@ -57,7 +56,7 @@ class RivalPolicy:
             ) from error
         self._state: State = None
 
-    def begin(self, situation: Mapping[str, float], seed: int) -> None:  # noqa: ARG002
+    def begin(self, situation: Situation, seed: int) -> None:  # noqa: ARG002
         """Return to the neutral state; situation and seed are not used."""
         self._state = None
 

@@ -7,7 +7,7 @@ vision, without a classifier of situations.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -15,6 +15,7 @@ from torch import Tensor
 from learner.checkpoint import CheckpointMetadata, RivalMetadata
 from learner.network.softmax_code import SoftmaxCode
 from learner.rivals.networks import Rival, make_rival, rival_config
+from learner.training.asked import Asked
 from learner.training.augmentation import augmented_input
 from learner.training.coupled import CoupledObjective
 from learner.training.divergence import backward
@@ -25,6 +26,7 @@ from learner.training.vmdnn_recipe import VMDNNRecipe, code_of
 from proto.config import Config, LearnerConfig, RivalConfig, RivalKind
 from proto.episode import Episode, Image
 from proto.metrics import Stage
+from proto.variables import Question
 
 
 class EndToEndTraining:
@@ -32,12 +34,12 @@ class EndToEndTraining:
 
     Attributes:
         code: how the outputs code actions.
-        classes: always empty.
+        asked: always empty.
         classifier: always None.
         parameters: what is trained: everything.
     """
 
-    classes: Mapping[str, tuple[float, ...]] = {}
+    asked: Sequence[Asked] = ()
     classifier = None
 
     def __init__(
@@ -103,7 +105,7 @@ class RivalRecipe:
     """The `Recipe` of a rival."""
 
     publish_every_epochs = None
-    pretraining_values: Sequence[str] = ()
+    pretraining_variables: Sequence[str] = ()
 
     def __init__(self, config: Config, kind: RivalKind) -> None:
         """Make a network with random weights."""
@@ -157,6 +159,8 @@ class RivalRecipe:
         return RivalCoupledTraining(self.network, code, self.config.learner, self.generator)
 
 
-def make_recipe(config: Config, rival: RivalKind | None) -> Recipe:
-    """The recipe of a rival, or of VMDNN if `rival` is None."""
-    return VMDNNRecipe(config) if rival is None else RivalRecipe(config, rival)
+def make_recipe(
+    config: Config, rival: RivalKind | None, questions: Sequence[Question] = ()
+) -> Recipe:
+    """The recipe of a rival, or of VMDNN if `rival` is None; only that asks questions."""
+    return VMDNNRecipe(config, questions) if rival is None else RivalRecipe(config, rival)

@@ -7,7 +7,7 @@ sequence, when the sequence is added.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,12 +19,14 @@ from torch.nn.utils.rnn import pad_sequence
 from learner.network.softmax_code import SoftmaxCode
 from learner.network.vision_input import vision_input
 from learner.network.vmdnn import VMDNN
+from learner.training.asked import Asked
 from learner.training.divergence import add_gradients
 from learner.training.interpolation import NeighbourGrid, mix_sequences
 from learner.training.sequences import Minibatch, Sequences
 from proto.body import ACTION_NAMES
 from proto.config import LearnerConfig
 from proto.episode import Episode, Floats
+from proto.variables import Situation
 
 _log = logging.getLogger(__name__)
 
@@ -51,11 +53,11 @@ class CoupledObjective:
 
     Attributes:
         code: how the outputs code actions; fixed, so that all policies of a run agree.
-        classes: always empty.
+        asked: always empty.
         classifier: always None.
     """
 
-    classes: Mapping[str, tuple[float, ...]] = {}
+    asked: Sequence[Asked] = ()
     classifier = None
 
     def __init__(
@@ -71,7 +73,7 @@ class CoupledObjective:
         self.code = code
         self._see = see
         self._generator = generator
-        self._situations: list[Mapping[str, float | str]] = []
+        self._situations: list[Situation] = []
         self._seen: list[Tensor] = []
         self._codes: list[Tensor] = []
         self._targets: list[Floats] = []

@@ -22,6 +22,7 @@ from torch import Tensor
 from learner.kernels import mixing as kernel
 from learner.network.softmax_code import SoftmaxCode
 from learner.training.sequences import Sequences
+from proto.variables import Situation
 
 OVERSHOOT: Final = 0.1
 """Points are drawn up to this fraction of a cell's width beyond its sides.
@@ -57,9 +58,7 @@ class NeighbourGrid:
     lengths. A situation without neighbours is never mixed.
     """
 
-    def __init__(
-        self, situations: Sequence[Mapping[str, float | str]], steps: Sequence[int]
-    ) -> None:
+    def __init__(self, situations: Sequence[Situation], steps: Sequence[int]) -> None:
         """Find the cells.
 
         Args:

@@ -1,13 +1,13 @@
 """Pre-training of the vision as a delayed-response classifier (paper, section 3.3).
 
-The network watches a whole sequence. At its end a temporary softmax layer on the PFC classifies
-the situation: where the object is and how it lies. The config names the values and the number of
-classes of each. The temporary layer is dropped when coupled training begins.
+The network watches a whole sequence. In a window of it, by default at its end, a temporary softmax
+layer on the PFC classifies the situation. The task says which variables are asked for, and when.
+The temporary layer is dropped when coupled training begins.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -18,27 +18,12 @@ from torch.nn import functional
 from learner.network.mtrnn import run_levels
 from learner.network.softmax_code import SoftmaxCode
 from learner.network.vmdnn import VMDNN
+from learner.training.asked import Asked, soft_label
 from learner.training.augmentation import augmented_input
 from learner.training.divergence import backward
 from learner.training.loss import kl_divergence
 from proto.config import PretrainingConfig
 from proto.episode import Episode, Image
-
-Classes = Mapping[str, tuple[float, ...]]
-"""Centres of the classes, by name of a value of the situation."""
-
-
-def classes_of(episodes: Sequence[Episode], labels: Mapping[str, int]) -> Classes:
-    """Classes that cover the episodes' situations evenly.
-
-    Args:
-        episodes: not empty.
-        labels: number of classes by name of the situation's value.
-    """
-    return {
-        name: _centres([episode.situation[name] for episode in episodes], count)
-        for name, count in labels.items()
-    }
 
 
 class Pretraining:
@@ -46,7 +31,7 @@ class Pretraining:
 
     Attributes:
         code: always None; the network cannot act yet.
-        classes: centres of the classes.
+        asked: what is asked for, in the order of the classifier's outputs.
         classifier: the temporary layer, from the PFC to all classes.
         parameters: what is trained: V_F, V_S, the PFC without feedback, and the classifier.
     """
@@ -56,7 +41,7 @@ class Pretraining:
     def __init__(
         self,
         network: VMDNN,
-        classes: Classes,
+        asked: Sequence[Asked],
         config: PretrainingConfig,
         generator: torch.Generator,
     ) -> None:
@@ -64,17 +49,17 @@ class Pretraining:
 
         Args:
             network: the network; its vision and PFC are trained.
-            classes: the classes; not empty.
-            config: in which part of a sequence it is classified, and how images are augmented.
+            asked: what is asked for; not empty.
+            config: how images are augmented.
             generator: draws the temporary layer's weights and the augmentation.
         """
-        self.classes = classes
+        self.asked = tuple(asked)
         self._network = network
         self._config = config
         self._generator = generator
         self._images: list[Image] = []
         self._labels: list[NDArray[np.float32]] = []
-        self._counts = [len(centres) for centres in classes.values()]
+        self._counts = [len(each.classes) for each in asked]
         self.classifier = nn.Linear(network.pfc.units, sum(self._counts))
         with torch.no_grad():
             for parameter in self.classifier.parameters():
@@ -91,10 +76,12 @@ class Pretraining:
         return len(self._images)
 
     def add(self, episode: Episode) -> None:
-        """Add a sequence; a value outside the classes is learned as the outermost class."""
-        labels = [
-            soft_label(episode.situation[name], centres) for name, centres in self.classes.items()
-        ]
+        """Add a sequence; a number outside the classes is learned as the outermost class.
+
+        Raises:
+            UserError: a choice that is none of the classes.
+        """
+        labels = [soft_label(episode.situation[each.variable], each.classes) for each in self.asked]
         self._labels.append(np.concatenate(labels))
         self._images.append(episode.images)
 
@@ -109,35 +96,26 @@ class Pretraining:
         labels = torch.from_numpy(np.stack([self._labels[index] for index in indices]))
         seen = self._network.see(augmented_input(images, self._config, self._generator))
         answers = self.classifier(run_levels([self._network.pfc], seen, "bottom_up"))
-        mask = self._answer_mask([len(image) for image in images])
+        lengths = [len(image) for image in images]
         losses = [
             kl_divergence(
-                functional.log_softmax(answer, dim=-1).unsqueeze(2), label[:, None, None], mask
+                functional.log_softmax(answer, dim=-1).unsqueeze(2),
+                label[:, None, None],
+                window_mask(lengths, each.window),
             )
-            for answer, label in zip(
+            for answer, label, each in zip(
                 torch.split(answers, self._counts, dim=-1),
                 torch.split(labels, self._counts, dim=-1),
+                self.asked,
                 strict=True,
             )
         ]
         return torch.stack(losses).mean()
 
-    def _answer_mask(self, lengths: Sequence[int]) -> Tensor:
-        """(B, T) one in the last part of each sequence, where it is classified."""
-        steps = torch.arange(max(lengths))
-        ends = torch.tensor(lengths)[:, None]
-        starts = (ends * (1 - self._config.answer_part)).floor()
-        return ((steps >= starts) & (steps < ends)).float()
 
-
-def soft_label(value: float, centres: Sequence[float]) -> NDArray[np.float32]:
-    """(classes,) one for the class with this centre; between two centres, shared by both."""
-    shares = [np.interp(value, centres, only) for only in np.eye(len(centres))]
-    return np.asarray(shares, np.float32)
-
-
-def _centres(values: Sequence[float], count: int) -> tuple[float, ...]:
-    """Centres of classes, evenly from the lowest to the highest value."""
-    low, high = min(values), max(values)
-    centres = np.linspace(low, max(high, low + 1e-6), count)  # centres must differ
-    return tuple(centres.tolist())
+def window_mask(lengths: Sequence[int], window: tuple[float, float]) -> Tensor:
+    """(B, T) one in the window of each sequence; its ends are shares of the sequence's length."""
+    steps = torch.arange(max(lengths))
+    ends = torch.tensor(lengths)[:, None]
+    first, last = ((ends * share).floor() for share in window)
+    return ((steps >= first) & (steps < last)).float()

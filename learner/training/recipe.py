@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import torch
@@ -10,6 +10,7 @@ from torch import nn
 
 from learner.checkpoint import CheckpointMetadata, RivalMetadata
 from learner.network.softmax_code import SoftmaxCode
+from learner.training.asked import Asked
 from learner.training.optimization import Hyperparameters, Objective
 from proto.config import Config
 from proto.episode import Episode
@@ -24,8 +25,8 @@ class StageObjective(Objective, Protocol):
         """How the outputs code actions; None in a stage in which the network cannot act yet."""
 
     @property
-    def classes(self) -> Mapping[str, tuple[float, ...]]:
-        """Centres of the classifier's classes, by name of the situation's value; may be empty."""
+    def asked(self) -> Sequence[Asked]:
+        """What the classifier is asked, in the order of its outputs; may be empty."""
 
     @property
     def classifier(self) -> nn.Module | None:
@@ -64,8 +65,8 @@ class Recipe(Protocol):
         """Coupled training gives a policy every so many epochs; None for at its end only."""
 
     @property
-    def pretraining_values(self) -> Sequence[str]:
-        """Names of the values that situations must have in pre-training."""
+    def pretraining_variables(self) -> Sequence[str]:
+        """Names of the variables that situations must have in pre-training."""
 
     def hyperparameters(self, stage: Stage, epochs: int) -> Hyperparameters:
         """Settings of one optimization.

@@ -1,6 +1,6 @@
 """Training of a network: pre-training, then coupled training in rounds.
 
-    trainer = Trainer(VMDNNRecipe(config), TutoringStore(folder))
+    trainer = Trainer(VMDNNRecipe(config, questions), TutoringStore(folder))
     while not trainer.finished:
         trainer.epoch()
     policy = trainer.policy_bytes(version=1)
@@ -21,6 +21,7 @@ from torch import Tensor
 from learner.checkpoint import (
     CLASSIFIER_PREFIX,
     NETWORK_PREFIX,
+    AskedMetadata,
     Checkpoint,
     CheckpointMetadata,
     CodeRanges,
@@ -87,7 +88,10 @@ class Trainer:
         torch.set_num_threads(config.learner.threads)
         self.recipe = recipe
         self._store = store
-        self._pretraining_store = store if pretraining_store is None else pretraining_store
+        self._pretraining_store, self._pretraining_task = store, config.task.name
+        if pretraining_store is not None:
+            self._pretraining_store = pretraining_store
+            self._pretraining_task = config.pretraining_task or config.task.name
         self._rounds = RoundSchedule(
             recipe.coupled_epochs, rounds, config.learner.corrections.epochs
         )
@@ -229,8 +233,9 @@ class Trainer:
 
     def _new_intake(self) -> Intake:
         if self.stage is Stage.PRETRAINING:
-            return Intake(self._pretraining_store, self.recipe.pretraining_values)
-        return Intake(self._store)
+            variables = self.recipe.pretraining_variables
+            return Intake(self._pretraining_store, self._pretraining_task, variables)
+        return Intake(self._store, self.recipe.config.task.name)
 
     def _new_optimization(self, objective: StageObjective) -> Optimization:
         pretraining = self.stage is Stage.PRETRAINING
@@ -280,6 +285,8 @@ class Trainer:
             epoch=self.epochs_done,
             loss=self.loss,
             config_digest=config.digest(),
+            task=config.task.name,
+            backend=config.simulator.backend,
             network=config.network,
             code=ranges,
             cases=len(self._intake.situations),
@@ -289,8 +296,14 @@ class Trainer:
         )
 
     def _training_metadata(self) -> TrainingMetadata:
-        classes = {} if self.objective is None else dict(self.objective.classes)
-        return TrainingMetadata(sequences=tuple(self._intake.taken), classes=classes)
+        asked = () if self.objective is None else self.objective.asked
+        return TrainingMetadata(
+            sequences=tuple(self._intake.taken),
+            asked={
+                each.variable: AskedMetadata(classes=each.classes, window=each.window)
+                for each in asked
+            },
+        )
 
     def _network_parts(self) -> dict[str, Tensor]:
         return prefixed(NETWORK_PREFIX, self.recipe.network.state_dict())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -10,12 +10,15 @@ import torch
 from learner.checkpoint import CheckpointMetadata
 from learner.network.softmax_code import SoftmaxCode
 from learner.network.vmdnn import VMDNN
+from learner.training.asked import Asked
 from learner.training.coupled import CoupledTraining
 from learner.training.optimization import Hyperparameters
-from learner.training.pretraining import Classes, Pretraining, classes_of
+from learner.training.pretraining import Pretraining
 from proto.config import Config
 from proto.episode import Episode
+from proto.errors import UserError
 from proto.metrics import Stage
+from proto.variables import Question
 
 
 class VMDNNRecipe:
@@ -23,9 +26,23 @@ class VMDNNRecipe:
 
     rival = None
 
-    def __init__(self, config: Config) -> None:
-        """Make a network with random weights."""
+    def __init__(self, config: Config, questions: Sequence[Question]) -> None:
+        """Make a network with random weights.
+
+        Args:
+            config: everything the training depends on.
+            questions: what pre-training asks about the situations of its task.
+
+        Raises:
+            UserError: pre-training has nothing to ask.
+        """
+        if config.learner.pretraining.epochs and not questions:
+            raise UserError(
+                f"the task {config.pretraining_task or config.task.name} asks no questions, so it"
+                " cannot be pre-trained on: set learner.pretraining.epochs=0"
+            )
         self.config = config
+        self._questions = tuple(questions)
         self.generator = torch.Generator().manual_seed(config.run.seed)
         self.network = VMDNN(config.network)
         self.network.initialize(
@@ -50,13 +67,9 @@ class VMDNNRecipe:
         return self.config.learner.publish_every_epochs
 
     @property
-    def pretraining_values(self) -> Sequence[str]:
-        """Names of the values that pre-training classifies."""
-        return tuple(self._labels)
-
-    @property
-    def _labels(self) -> Mapping[str, int]:
-        return self.config.learner.pretraining.labels
+    def pretraining_variables(self) -> Sequence[str]:
+        """Names of the variables that pre-training asks for."""
+        return tuple(question.variable for question in self._questions)
 
     def hyperparameters(self, stage: Stage, epochs: int) -> Hyperparameters:
         """Settings of the optimization of a stage, or of one round of it."""
@@ -76,7 +89,7 @@ class VMDNNRecipe:
     ) -> Pretraining | CoupledTraining:
         """Objective of a stage; its classes or ranges are those of the episodes."""
         if stage is Stage.PRETRAINING:
-            return self._pretraining(classes_of(episodes, self._labels))
+            return self._pretraining([Asked.of(each, episodes) for each in self._questions])
         return self._coupled_training(code_of(episodes, self.config))
 
     def restored_objective(
@@ -86,12 +99,14 @@ class VMDNNRecipe:
         code = metadata.softmax_code()
         if code is not None:
             return self._coupled_training(code)
-        classes = metadata.training.classes if metadata.training else {}
-        return self._pretraining(classes) if classes else None
+        asked = metadata.training.asked if metadata.training else {}
+        if not asked:
+            return None
+        return self._pretraining([Asked(n, each.classes, each.window) for n, each in asked.items()])
 
-    def _pretraining(self, classes: Classes) -> Pretraining:
+    def _pretraining(self, asked: Sequence[Asked]) -> Pretraining:
         config = self.config.learner.pretraining
-        return Pretraining(self.network, classes, config, self.generator)
+        return Pretraining(self.network, asked, config, self.generator)
 
     def _coupled_training(self, code: SoftmaxCode) -> CoupledTraining:
         return CoupledTraining(self.network, code, self.config.learner, self.generator)

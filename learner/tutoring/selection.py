@@ -1,4 +1,4 @@
-"""Which sequences of a store a training takes in, and in which order."""
+"""Which sequences of a store a training learns from, and in which order."""
 
 from __future__ import annotations
 
@@ -8,46 +8,48 @@ from collections.abc import Iterable
 import numpy as np
 
 from learner.tutoring.store import TutoringStore
-from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.episode import Episode, Kind
 from proto.errors import UserError
+from proto.variables import Value
 
-_log = logging.getLogger(__name__)
+LOG = logging.getLogger(__name__)
 
 
 class Intake:
-    """Hands out each sequence of a store once, and none that cannot be learned from.
+    """Gives each sequence of a store to the training once, except those it cannot learn from.
 
     Attributes:
-        taken: ids of the sequences handed out, in that order.
-        situations: the situations that they show, each once.
-        refused: why the others of the store cannot be learned from, by id.
+        taken: ids of the sequences given so far, in that order.
+        situations: the different situations of these sequences.
+        refused: why the other sequences cannot be learned from, by id.
     """
 
-    def __init__(self, store: TutoringStore, values: Iterable[str] = ()) -> None:
-        """Take in from `store`.
+    def __init__(self, store: TutoringStore, task: str, variables: Iterable[str] = ()) -> None:
+        """Take sequences from `store`.
 
         Args:
             store: the sequences.
-            values: names that their situations must have.
+            task: name of the task that they must show.
+            variables: names of the variables that pre-training asks about.
         """
         self._store = store
-        self._values = tuple(values)
+        self._task = task
+        self._variables = tuple(variables)
         self.taken: list[str] = []
-        self.situations: set[frozenset[tuple[str, float]]] = set()
+        self.situations: set[frozenset[tuple[str, Value]]] = set()
         self.refused: dict[str, str] = {}
 
     def new(self) -> list[Episode]:
-        """Sequences that came in since the last call, ordered by id."""
+        """Sequences that were added since the last call, ordered by id."""
         known = {*self.taken, *self.refused}
         return self._take(name for name in self._store.ids if name not in known)
 
     def again(self, sequences: Iterable[str]) -> list[Episode]:
-        """These sequences in this order, as they were taken before a restart."""
+        """The sequences with these ids, in this order, as they were taken before a restart."""
         wanted = tuple(sequences)
         episodes = self._take(wanted)
         if len(episodes) < len(wanted):
-            _log.warning(
+            LOG.warning(
                 "%d of %d sequences of the checkpoint are gone; training goes on without them,"
                 " not exactly as it would have",
                 len(wanted) - len(episodes),
@@ -56,7 +58,7 @@ class Intake:
         return episodes
 
     def complaint(self) -> str:
-        """Why there is nothing to learn from, and what to do."""
+        """Why the store has no sequence to learn from, and what to do."""
         problems = {**self._store.damaged, **self.refused}
         folder = self._store.folder
         if not problems:
@@ -73,7 +75,7 @@ class Intake:
             try:
                 self._check(episode)
             except UserError as error:
-                _log.warning("tutoring sequence refused: %s", error)
+                LOG.warning("tutoring sequence refused: %s", error)
                 self.refused[sequence] = str(error)
                 continue
             episodes.append(episode)
@@ -82,19 +84,20 @@ class Intake:
         return episodes
 
     def _check(self, episode: Episode) -> None:
+        if episode.task != self._task:
+            raise UserError(
+                f"{episode.id} shows the task {episode.task!r}, not {self._task!r}; take sequences"
+                " of that task, or set task.name (for pre-training: learner.pretraining.task)"
+            )
         if episode.kind not in (Kind.TUTORING, Kind.CORRECTION):
             raise UserError(f"{episode.id} is a {episode.kind} episode, not a tutored one")
-        if episode.steps == 0 or episode.images.shape[1:] != (IMAGE_HEIGHT, IMAGE_WIDTH):
-            raise UserError(
-                f"{episode.id} has pictures {episode.images.shape}, not"
-                f" (steps, {IMAGE_HEIGHT}, {IMAGE_WIDTH})"
-            )
+        if episode.steps == 0:
+            raise UserError(f"{episode.id} has no steps")
         if not np.isfinite(episode.targets).all():
             raise UserError(f"{episode.id} has targets that are not finite numbers")
-        for value in self._values:
-            if value not in episode.situation:
+        for variable in self._variables:
+            if variable not in episode.situation:
                 raise UserError(
-                    f"{episode.id} has no {value!r} in its situation, which"
-                    " learner.pretraining.labels asks for; it has"
-                    f" {', '.join(sorted(episode.situation))}"
+                    f"{episode.id} has no {variable!r} in its situation, which pre-training asks"
+                    f" for; it has {', '.join(sorted(episode.situation))}"
                 )

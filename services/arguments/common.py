@@ -1,4 +1,4 @@
-"""Arguments that many subcommands share."""
+"""Arguments that several subcommands take, and what they mean."""
 
 from __future__ import annotations
 
@@ -6,15 +6,26 @@ import argparse
 import logging
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from importlib.resources import files
 from pathlib import Path
+from typing import Final
 
 from proto.config import Config, load_config
+from proto.errors import UserError
+
+LARGEST_SEED: Final = 2**32 - 1
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     """Add --config and --set."""
-    parser.add_argument("--config", type=Path, help="YAML file; without it, all defaults")
+    parser.add_argument(
+        "--config",
+        type=_config_argument,
+        metavar="FILE|NAME",
+        help="YAML file, or a built-in configuration: experiment1, paper, smoke; without it, all"
+        " defaults",
+    )
     parser.add_argument(
         "--set",
         dest="overrides",
@@ -26,23 +37,47 @@ def add_config(parser: argparse.ArgumentParser) -> None:
 
 
 def add_connection(parser: argparse.ArgumentParser) -> None:
-    """Add --config, --set and --connect, for whatever looks at the bus."""
+    """Add --config, --set and --connect, for a command that uses the bus."""
     add_config(parser)
     parser.add_argument(
         "--connect",
         metavar="tcp/HOST:PORT",
-        help="where the hub listens; without it, the config's hub.endpoint",
+        help="where the hub listens; without it, hub.endpoint of the configuration",
     )
 
 
 def add_process(parser: argparse.ArgumentParser) -> None:
     """Add --config, --set, --connect and --id, for a process on the bus."""
     add_connection(parser)
-    parser.add_argument("--id", type=_id, help="what this process is called on the bus")
+    parser.add_argument("--id", type=_id, help="name of this process on the bus")
+
+
+def config_file(name: str) -> Path:
+    """The file of a configuration: a path, or the name of one that comes with vmdnn.
+
+    Raises:
+        UserError: there is neither a file nor a built-in configuration of this name.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or path.name != name:
+        return path
+    built_in = {file.stem: file for file in Path(str(files("deploy")), "config").glob("*.yaml")}
+    if name not in built_in:
+        raise UserError(
+            f"config file {name} does not exist; built in are: {', '.join(sorted(built_in))}"
+        )
+    return built_in[name]
+
+
+def _config_argument(name: str) -> Path:
+    try:
+        return config_file(name)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def config_of(arguments: argparse.Namespace) -> Config:
-    """The configuration that the arguments of `add_config` or `add_process` ask for."""
+    """The configuration that the arguments of `add_config`, or of more than these, ask for."""
     overrides = list(arguments.overrides)
     if getattr(arguments, "connect", None) is not None:
         overrides.append(f"hub.endpoint={arguments.connect}")
@@ -50,7 +85,7 @@ def config_of(arguments: argparse.Namespace) -> Config:
 
 
 def start_logging(role: str) -> None:
-    """Log lines to standard error, each with time and role."""
+    """Log to standard error; each line has the time and the role."""
     logging.basicConfig(
         level=logging.INFO, format=f"%(asctime)s {role} %(levelname)s %(message)s", force=True
     )
@@ -65,7 +100,7 @@ def _id(text: str) -> str:
 
 
 def add_playing(parser: argparse.ArgumentParser) -> None:
-    """Add what every command that plays episodes without the bus takes, besides `add_config`."""
+    """Add --task, --backend and --workers, for a command that plays episodes without the bus."""
     parser.add_argument("--task", help="task to play; without it, task.name of the configuration")
     parser.add_argument(
         "--backend", help="simulator; without it, simulator.backend of the configuration"
@@ -85,17 +120,20 @@ def playing_config(arguments: argparse.Namespace, overrides: Sequence[str] = ())
     return load_config(arguments.config, [*arguments.overrides, *named, *overrides])
 
 
-def seed(text: str) -> int:
-    """A whole number of at least zero, for `type=` of an argument."""
-    number = int(text)
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"{text} is less than 0")
+def integer(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Make the `type=` of an argument that is an integer in least..most (None: unlimited)."""
+    limits = f"of at least {least}" if most is None else f"from {least} to {most}"
+
+    def number(text: str) -> int:
+        value = int(text) if re.fullmatch(r"[-+]?[0-9]{1,18}", text) else None
+        if value is None or value < least or (most is not None and value > most):
+            raise argparse.ArgumentTypeError(f"{text!r} is not an integer {limits}")
+        return value
+
     return number
 
 
-def positive(text: str) -> int:
-    """A whole number of at least one, for `type=` of an argument."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{text} is less than 1")
-    return number
+seed = integer(0, LARGEST_SEED)
+"""`type=` of an argument that is a seed."""
+positive = integer(1)
+"""`type=` of an argument that is a number of things."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from learner.tutoring.store import TutoringStore
-from services.arguments.common import positive
+from services.arguments.common import positive, seed
 from services.arguments.training import interruption
 from services.terminal.progress import progress_bar
 from services.trials import sweeps
@@ -23,13 +23,13 @@ Stores = tuple[TutoringStore, TutoringStore | None]
 def add_sweep(parser: argparse.ArgumentParser, *, trials: int) -> None:
     """Add --seeds, --trials (with this default) and --trial-seed."""
     parser.add_argument(
-        "--seeds", type=int, nargs="+", default=[1, 2, 3], help="seeds of the trainings"
+        "--seeds", type=seed, nargs="+", default=[1, 2, 3], help="seeds of the trainings"
     )
     parser.add_argument(
         "--trials", type=positive, default=trials, help="situations for each network"
     )
     parser.add_argument(
-        "--trial-seed", type=int, default=1000, help="seed of the situations, the same for all"
+        "--trial-seed", type=seed, default=1000, help="seed of the situations, the same for all"
     )
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from proto.membership import Lifecycle
-from services.arguments.common import add_process, config_of, start_logging
+from proto.keys import Role
+from services.arguments.common import add_process
+from services.arguments.process import run_process
 from services.hub import Hub
 
 
@@ -16,8 +17,4 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Listen at the endpoint until told to stop."""
-    start_logging("hub")
-    lifecycle = Lifecycle()
-    lifecycle.stop_on_signals()
-    Hub(config_of(arguments), arguments.id or "hub").run(lifecycle)
-    return 0
+    return run_process(arguments, Role.HUB, Hub)

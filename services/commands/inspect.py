@@ -1,4 +1,4 @@
-"""`vmdnn inspect`: a network's subnets, a checkpoint's metadata, what the vision represents."""
+"""`vmdnn inspect`: networks, checkpoints, tasks, and what the vision represents."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from pathlib import Path
 
 from rich.console import Console
 
+from actors.tasks.registry import make_task
 from learner.checkpoint import load_checkpoint
 from learner.network.subnets import subnets
 from learner.network.vision_probe import Vision, score_classifier, score_regression
 from learner.tutoring.store import TutoringStore
+from proto.config import load_config
 from proto.episode import Episode
 from services.arguments.common import add_config, config_of
 from services.arguments.training import filled_store
@@ -22,6 +24,7 @@ from services.terminal.network_tables import (
     subnet_numbers,
     subnet_table,
 )
+from services.terminal.task_tables import task_description, task_table
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +36,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     checkpoint = things.add_parser("checkpoint", help="the metadata of a policy or checkpoint")
     checkpoint.set_defaults(inspect=_inspect_checkpoint)
     checkpoint.add_argument("file", type=Path, metavar="FILE", help="a .safetensors file")
+    task = things.add_parser("task", help="a task's variables, phases, cases and baselines")
+    task.set_defaults(inspect=_inspect_task)
+    add_config(task)
+    task.add_argument("--task", help="task; without it, task.name of the configuration")
     vision = things.add_parser("vision", help="how well situations can be read from V_S")
     vision.set_defaults(inspect=_inspect_vision)
     vision.add_argument(
@@ -47,7 +54,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     vision.add_argument(
         "--test", type=Path, required=True, help="folder of sequences of other situations"
     )
-    for thing in (network, checkpoint, vision):
+    for thing in (network, checkpoint, task, vision):
         thing.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
@@ -72,6 +79,15 @@ def _inspect_checkpoint(arguments: argparse.Namespace) -> None:
     else:
         for name, value in metadata.items():
             print(f"{name:14} {value}")
+
+
+def _inspect_task(arguments: argparse.Namespace) -> None:
+    named = [] if arguments.task is None else [f"task.name={arguments.task}"]
+    task = make_task(load_config(arguments.config, [*arguments.overrides, *named]).task)
+    if arguments.json:
+        print(json.dumps(task_description(task), indent=2))
+    else:
+        Console().print(task_table(task))
 
 
 def _inspect_vision(arguments: argparse.Namespace) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from actors.tasks.registry import TASKS
+from actors.tasks.registry import make_task
 from learner.learner import Learner
-from proto.bus import open_bus
+from proto.bus import Bus
+from proto.config import Config
 from proto.keys import Role
-from proto.membership import Lifecycle, only_one
-from services.arguments.common import add_process, config_of, start_logging
+from proto.lifecycle import Lifecycle
+from services.arguments.common import add_process
+from services.arguments.process import run_process
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -19,15 +21,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Learn until told to stop."""
-    start_logging("learner")
-    config = config_of(arguments)
-    lifecycle = Lifecycle()
-    lifecycle.stop_on_signals()
-    tasks = {name: task() for name, task in TASKS.items()}
-    process = arguments.id or "learner"
-    with (
-        only_one(config.run_folder, Role.LEARNER, "learner"),
-        open_bus(config.hub, config.run.name, Role.LEARNER, process) as bus,
-    ):
-        Learner(config, bus, lifecycle, tasks=tasks).run()
-    return 0
+    return run_process(arguments, Role.LEARNER, _make_learner)
+
+
+def _make_learner(config: Config, bus: Bus, lifecycle: Lifecycle) -> Learner:
+    """A learner that knows the task and that of pre-training."""
+    names = filter(None, (config.task.name, config.pretraining_task))
+    tasks = {name: make_task(config.task_called(name)) for name in names}
+    return Learner(config, bus, lifecycle, tasks=tasks)

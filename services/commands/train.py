@@ -12,6 +12,7 @@ from typing import Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from actors.tasks.registry import make_pretraining_task, make_task
 from learner.checkpoint import policy_file, training_file
 from learner.training.coupled import CoupledTraining
 from learner.training.trainer import Trainer
@@ -41,7 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
     config = config_of(arguments)
     store, others = training_stores(arguments)
     folder: Path = arguments.out
-    trainer = open_training(VMDNNRecipe(config), folder, store, others)
+    task = make_task(config.task) if others is None else make_pretraining_task(config)
+    trainer = open_training(VMDNNRecipe(config, task.questions), folder, store, others)
     config.save(folder / "config.yaml")
     if trainer.finished:
         print(f"{folder} is trained already; learner.epochs above {trainer.epochs_done} goes on")

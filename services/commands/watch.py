@@ -1,4 +1,4 @@
-"""`vmdnn watch`: see what all processes of a run are doing."""
+"""`vmdnn watch`: show what all processes of a run are doing."""
 
 from __future__ import annotations
 
@@ -12,9 +12,12 @@ from rich.console import Console
 
 from proto.bus import open_bus
 from proto.keys import Role
-from proto.membership import METRICS_PERIOD_S, Lifecycle
+from proto.lifecycle import Lifecycle
+from proto.membership import METRICS_PERIOD_S
 from services.arguments.common import add_connection, config_of
-from services.board import Board, View, display, tables
+from services.board import Board, RunView
+from services.terminal.display import display
+from services.terminal.run_tables import run_tables
 
 ONCE_WITHIN_S: Final = 2.5 * METRICS_PERIOD_S
 
@@ -22,7 +25,9 @@ ONCE_WITHIN_S: Final = 2.5 * METRICS_PERIOD_S
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_connection(parser)
-    parser.add_argument("--once", action="store_true", help="show what is known now, and end")
+    parser.add_argument(
+        "--once", action="store_true", help="show the state at this moment, and end"
+    )
     parser.add_argument("--json", action="store_true", help="with --once: print JSON")
 
 
@@ -32,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     with open_bus(config.hub, config.run.name, Role.WATCH, f"watch-{os.getpid()}") as bus:
         board = Board(bus)
         if arguments.once:
-            return _show_once(board.wait_until_all_told(ONCE_WITHIN_S), arguments.json)
+            return _show_once(board.wait_for_all(ONCE_WITHIN_S), arguments.json)
         lifecycle = Lifecycle()
         lifecycle.stop_on_signals()
         with display(Console()) as show:
@@ -42,16 +47,16 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _show_once(view: View, as_json: bool) -> int:
+def _show_once(view: RunView, as_json: bool) -> int:
     if not view.metrics:
         print(
-            f"no process of run {view.run!r} tells anything; is that the run's name? "
-            "Name another with --set run.name=NAME or --config RUN/config.yaml",
+            f"no process of run {view.run!r} answers; is that the run's name? "
+            "Choose another with --set run.name=NAME or --config RUN/config.yaml",
             file=sys.stderr,
         )
         return 1
     if as_json:
         print(json.dumps(view.as_json(), indent=2))
     else:
-        Console().print(tables(view))
+        Console().print(run_tables(view))
     return 0

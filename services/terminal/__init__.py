@@ -1,1 +1,1 @@
-"""What people read in a terminal: the view of a run, progress bars, tables."""
+"""What people read in a terminal: the state of a run, progress bars, tables."""

@@ -9,7 +9,6 @@ from typing import Any
 from rich.box import SIMPLE
 from rich.table import Table
 
-from actors.tasks.experiment1.task import SUBTASKS
 from learner.network.subnets import Subnet
 from learner.network.vision_probe import ClassifierScore, RegressionScore
 
@@ -52,7 +51,8 @@ def classifier_table(scores: Sequence[ClassifierScore], sequences: int) -> Table
     for column in ("value", "classes", "nearest class %", "mean error"):
         table.add_column(column, justify="left" if column == "value" else "right", no_wrap=True)
     for score in scores:
-        right, error = f"{100 * score.right:.1f}", _with_unit(score.value, score.error)
+        right = f"{100 * score.right:.1f}"
+        error = "" if score.error is None else _with_unit(score.value, score.error)
         table.add_row(score.value, str(score.classes), right, error)
     return table
 
@@ -75,10 +75,9 @@ def regression_table(scores: Sequence[RegressionScore], learned: int, tested: in
     table.add_column("phase", no_wrap=True)
     for value in values:
         table.add_column(value, justify="right", no_wrap=True)
-    names = dict(enumerate(SUBTASKS, 1))
-    for phase, group in groupby(scores, lambda score: score.phase):
+    for number, (phase, group) in enumerate(groupby(scores, lambda score: score.phase), 1):
         errors = (_with_unit(score.value, score.error) for score in group)
-        table.add_row(f"{phase} {names.get(phase, '')}", *errors)
+        table.add_row(f"{number} {phase}", *errors)
     blind = {score.value: score.blind_error for score in scores}
     table.add_section()
     table.add_row("without seeing", *(_with_unit(value, blind[value]) for value in values))

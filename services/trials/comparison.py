@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from rich.table import Table
 
+from actors.tasks.registry import make_pretraining_task
 from learner.rivals.networks import weights_of
 from learner.rivals.rival_recipe import make_recipe
 from learner.tutoring.store import TutoringStore
@@ -49,7 +50,8 @@ def variants(config: Config, names: Sequence[str]) -> list[Variant]:
 
 def weights(variant: Variant) -> int:
     """Number of weights and biases of a contender."""
-    return weights_of(make_recipe(variant.config, variant.rival).network)
+    questions = make_pretraining_task(variant.config).questions
+    return weights_of(make_recipe(variant.config, variant.rival, questions).network)
 
 
 def tutored_again(

@@ -16,6 +16,7 @@ from typing import Self
 
 from pydantic import ValidationError
 
+from actors.tasks.registry import make_pretraining_task
 from learner.checkpoint import load_checkpoint, policy_file, training_file
 from learner.rivals.rival_recipe import make_recipe
 from learner.training.recipe import Recipe
@@ -86,7 +87,8 @@ class SweepRun:
 
     def recipe(self) -> Recipe:
         """The network with random weights, and how it is trained."""
-        return make_recipe(self.config, self.variant.rival)
+        questions = make_pretraining_task(self.config).questions
+        return make_recipe(self.config, self.variant.rival, questions)
 
 
 @dataclass(frozen=True)

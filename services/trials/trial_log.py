@@ -2,25 +2,41 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
-from proto.codec import MessageError, Number, Table, Wire, decode, encode, message, schema_of
-from proto.episode import Episode, Id, Outcome
+from proto.codec import (
+    Integer,
+    MessageError,
+    Wire,
+    decode,
+    encode,
+    message,
+    record_of,
+    schema_of,
+)
+from proto.episode import SIMULATION_FAILED, Episode, Id, Outcome
 from proto.errors import UserError
-from proto.messages import Count, Rollout
+from proto.messages import Count, EpisodeFailed, Rollout
+from proto.recordings import format1
+from proto.storage import append_line, drop_unfinished_line
+from proto.variables import SituationField
 
 LOG = logging.getLogger(__name__)
 
+FORMAT: Final = 2
+"""Format of the lines that are written; those of format 1 can be read, too."""
 
-@message("counted_trial", 1, form="json")
+
+@message("counted_trial", 2, form="json")
 @dataclass(frozen=True)
 class CountedTrial:
-    """One line of the book.
+    """One line of the log.
 
     Attributes:
         run_id: training that the policy comes from.
@@ -28,8 +44,9 @@ class CountedTrial:
         seed: seed of the situation; it tells one trial of a version from another.
         episode: id of the episode.
         actor: who played it.
-        situation: the situation's values by name.
+        situation: the values of the task's variables by name.
         outcome: how it ended.
+        format: format of the line.
     """
 
     run_id: Id
@@ -37,8 +54,9 @@ class CountedTrial:
     seed: int
     episode: Id
     actor: Id
-    situation: Annotated[Mapping[str, float], Table(Number(), most=32)]
+    situation: SituationField
     outcome: Outcome
+    format: Annotated[int, Integer(FORMAT, FORMAT)] = FORMAT
 
     @classmethod
     def of(cls, episode: Episode, run_id: str) -> CountedTrial:
@@ -77,7 +95,29 @@ def read_trials(path: Path) -> list[CountedTrial]:
 
 
 def _trial(line: bytes) -> CountedTrial:
-    return decode(Wire(schema_of(CountedTrial).encoding, line), CountedTrial)
+    """The trial of a line, which may be of format 1.
+
+    Raises:
+        MessageError: it is no such line, or one of a newer format.
+    """
+    encoding = schema_of(CountedTrial).encoding
+    try:
+        values = json.loads(line)
+        number = values.setdefault("format", 1)
+        if number == 1:
+            outcome = format1.outcome_of(values["outcome"])
+            values["outcome"] = record_of(Outcome).pack(outcome)
+            values["format"] = FORMAT
+            line = json.dumps(values).encode()
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise MessageError("payload", f"is no counted trial: {error!r:.128}") from error
+    if isinstance(number, int) and number > FORMAT:
+        raise MessageError(
+            "format",
+            f"{number} was written by a newer vmdnn; this one reads formats up to {FORMAT}:"
+            " update vmdnn to read it",
+        )
+    return decode(Wire(encoding, line), CountedTrial)
 
 
 class TrialLog:
@@ -86,25 +126,38 @@ class TrialLog:
     def __init__(self, path: Path) -> None:
         """Open a book, or begin it. A line that a killed process did not finish is dropped."""
         self._path = path
-        path.parent.mkdir(parents=True, exist_ok=True)
         self._outcomes: dict[tuple[str, int], dict[int, Outcome]] = defaultdict(dict)
-        content = path.read_bytes() if path.exists() else b""
-        whole = content[: content.rfind(b"\n") + 1]
-        if whole != content:
+        if drop_unfinished_line(path):
             LOG.warning("%s: dropped its last line, which was not finished", path)
-            with path.open("r+b") as file:
-                file.truncate(len(whole))
-        for number, line in enumerate(whole.splitlines(), 1):
+        content = path.read_bytes() if path.exists() else b""
+        for number, line in enumerate(content.splitlines(), 1):
             self._read(line, number)
 
     def add(self, rollout: Rollout) -> bool:
-        """Count a trial; False if it was counted before."""
-        trial = CountedTrial.of(rollout.episode, rollout.run_id)
-        if not self._count(trial):
-            return False
-        with self._path.open("ab") as file:
-            file.write(trial.line())
-        return True
+        """Count a trial, on disk first; False if it was counted before.
+
+        Raises:
+            UserError: it cannot be written; then it is not counted.
+        """
+        return self._add(CountedTrial.of(rollout.episode, rollout.run_id))
+
+    def add_failure(self, report: EpisodeFailed) -> bool:
+        """Count a trial whose simulation failed as a failure; False if it was counted before.
+
+        Raises:
+            UserError: it cannot be written; then it is not counted.
+        """
+        return self._add(
+            CountedTrial(
+                run_id=report.training,
+                policy_version=report.policy_version,
+                seed=report.seed,
+                episode=report.id,
+                actor=report.actor,
+                situation=report.situation,
+                outcome=SIMULATION_FAILED,
+            )
+        )
 
     def versions(self, run_id: str) -> list[int]:
         """Policy versions of a training that were tried, oldest first."""
@@ -114,6 +167,12 @@ class TrialLog:
     def outcomes(self, run_id: str, policy_version: int) -> Mapping[int, Outcome]:
         """Outcomes of a policy version by the trial's seed."""
         return dict(self._outcomes.get((run_id, policy_version), {}))
+
+    def _add(self, trial: CountedTrial) -> bool:
+        if trial.seed in self.outcomes(trial.run_id, trial.policy_version):
+            return False
+        append_line(self._path, trial.line())
+        return self._count(trial)
 
     def _count(self, trial: CountedTrial) -> bool:
         outcomes = self._outcomes[trial.run_id, trial.policy_version]

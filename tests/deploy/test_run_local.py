@@ -6,12 +6,13 @@ import os
 import signal
 import socket
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from ports import free_endpoint
+from processes import eventually
 
 from deploy.run_local import (
     DEFAULT_CONFIG,
@@ -23,17 +24,9 @@ from deploy.run_local import (
 )
 from deploy.supervision import ProcessState
 from proto.config import Config, LearnerConfig, load_config
-from tests.ports import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "deploy" / "config" / "smoke.yaml"
-
-
-def wait_for(condition: Callable[[], bool], timeout_s: float = 120.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.1)
 
 
 def processes_that_name(text: str) -> list[str]:
@@ -69,19 +62,20 @@ def started(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
+@pytest.mark.timeout(500)  # more than its own limits together
 def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> None:
     run = tmp_path / "smoke"
     with started(tmp_path) as process:
-        wait_for(lambda: any(run.glob("tutoring/*.mcap")))
+        eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept")
         os.killpg(process.pid, signal.SIGINT)  # Ctrl-C
-        output, errors = process.communicate(timeout=90)
+        output, errors = process.communicate(timeout=60)
         assert process.returncode == 0, errors
         assert "starting run smoke with 1 actor" in output
         assert not processes_that_name(str(tmp_path))
     kept = {file.name: file.stat().st_mtime_ns for file in run.glob("tutoring/*.mcap")}
 
     with started(tmp_path) as process:
-        output, errors = process.communicate(timeout=280)
+        output, errors = process.communicate(timeout=240)
         assert process.returncode == 0, errors
         assert "going on with run smoke" in output
         assert "4 policy versions" in output
@@ -98,7 +92,7 @@ def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> N
 
     # With another network the run cannot go on, and nothing of it is touched.
     with started(tmp_path, "--set", "network.pfc.units=7") as process:
-        output, errors = process.communicate(timeout=120)
+        output, errors = process.communicate(timeout=60)
         assert process.returncode == 2, output
         assert "learner cannot go on" in errors
         assert not processes_that_name(str(tmp_path))
@@ -108,7 +102,7 @@ def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> N
 
 def test_a_process_that_is_given_bad_input_ends_the_run_and_says_why(tmp_path: Path) -> None:
     with started(tmp_path, "--backend", "nosuchsimulator") as process:
-        _, errors = process.communicate(timeout=120)
+        _, errors = process.communicate(timeout=60)
     assert process.returncode == 2
     assert "there is no backend 'nosuchsimulator'" in errors
     assert not processes_that_name(str(tmp_path))

@@ -6,23 +6,15 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from processes import eventually
 
 from deploy.supervision import ProcessState, Program, Supervisor
 from proto.errors import UserError
 
 SLEEP = (sys.executable, "-c", "import time; time.sleep(600)")
-
-
-def wait_for(condition: Callable[[], bool], timeout_s: float = 20.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.05)
 
 
 def is_alive(pid: int) -> bool:
@@ -41,7 +33,7 @@ def test_all_run_under_their_names_and_are_gone_afterwards(tmp_path: Path) -> No
     with Supervisor([Program("hub", SLEEP), Program("actor", SLEEP, processes=2)], tmp_path) as s:
         s.start("hub")
         s.start("actor")
-        wait_for(lambda: all(p.pid for p in s.processes()))
+        eventually(lambda: all(p.pid for p in s.processes()), "all three processes run")
         found = states(s)
         assert set(found) == {"hub", "actor-1", "actor-2"}
         assert all(is_alive(process.pid) for process in found.values())
@@ -51,17 +43,19 @@ def test_all_run_under_their_names_and_are_gone_afterwards(tmp_path: Path) -> No
 def test_a_killed_process_comes_back(tmp_path: Path) -> None:
     with Supervisor([Program("actor", SLEEP)], tmp_path) as supervisor:
         supervisor.start("actor")
-        wait_for(lambda: states(supervisor)["actor"].state == "RUNNING")
+        eventually(lambda: states(supervisor)["actor"].state == "RUNNING", "the first process runs")
         first = states(supervisor)["actor"].pid
         os.kill(first, signal.SIGKILL)
-        wait_for(lambda: states(supervisor)["actor"].pid not in (0, first))
+        eventually(
+            lambda: states(supervisor)["actor"].pid not in (0, first), "another process runs"
+        )
 
 
 def test_bad_input_is_not_tried_again(tmp_path: Path) -> None:
     command = (sys.executable, "-c", "import sys; print('no such thing'); sys.exit(2)")
     with Supervisor([Program("learner", command)], tmp_path) as supervisor:
         supervisor.start("learner")
-        wait_for(lambda: states(supervisor)["learner"].gave_up)
+        eventually(lambda: states(supervisor)["learner"].gave_up, "supervisord gives up")
         assert "no such thing" in states(supervisor)["learner"].log.read_text()
 
 
@@ -71,7 +65,7 @@ def test_each_program_gets_its_own_thread_count(tmp_path: Path) -> None:
     with Supervisor([Program("learner", show, threads=3)], folder) as supervisor:
         supervisor.start("learner")
         log = states(supervisor)["learner"].log
-        wait_for(lambda: log.exists() and log.read_text() == "3\n")
+        eventually(lambda: log.exists() and log.read_text() == "3\n", "the log is written")
         assert log.parent == folder
 
 
@@ -104,4 +98,4 @@ def test_nothing_outlives_a_supervisor_that_is_killed(tmp_path: Path, deadly: in
         child = int(parent.stdout.readline())
         assert is_alive(child)
         parent.send_signal(deadly)
-    wait_for(lambda: not is_alive(child))
+    eventually(lambda: not is_alive(child), "the child is gone")

@@ -16,6 +16,9 @@ from proto.body import ACTION_VALUES
 from proto.config import Config
 from proto.episode import Episode
 from proto.errors import UserError
+from proto.variables import Question
+
+QUESTIONS = (Question("object_y_m", 3), Question("object_yaw_deg", 5))
 
 MakeConfig = Callable[..., Config]
 
@@ -27,7 +30,7 @@ def trainer(
     store = TutoringStore(tmp_path / "tutoring")
     for episode in bar_episodes():
         store.add(episode)
-    trainer = Trainer(VMDNNRecipe(small_config(pretraining=1)), store)
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=1), QUESTIONS), store)
     trainer.epoch()
     return trainer
 

@@ -38,6 +38,18 @@ def written(folder: Path, text: str) -> Path:
         ),
         ("- a list", "expected `section: ...` lines"),
         ("learner: {rate", "cannot be read"),
+        ("learner: {epochs: yes}", "learner.epochs"),
+        ("learner: {epochs: true}", "learner.epochs"),
+        ("learner: {epochs: '5'}", "learner.epochs"),
+        ("learner: {epochs: 5.0}", "learner.epochs"),
+        ("learner: {rate: true}", "learner.rate"),
+        ("actor: {practice: no}", "actor.practice"),
+        ("learner: {rate: 1, rate: 2}", "the key 'rate' stands twice"),
+        ("run: {seed: 1}\ntutor:\nrun: {seed: 2}", "in line 1 and in line 3"),
+        ("{learner: {epoch: 1}}", "did you mean learner.epochs?"),
+        ("tutor: {repeats: 1001}", "must not exceed 1000: a case has so many seeds"),
+        ("learner: {pretraining: {repeats: 1001}}", "must not exceed 1000"),
+        ("run: {folder: ~nobody-of-this-name/runs}", "~ cannot be expanded"),
     ],
 )
 def test_what_is_wrong_is_named(
@@ -94,3 +106,49 @@ def test_the_digest_tells_what_matters_from_what_does_not() -> None:
     digest = Config().digest()
     assert Config(run=RunConfig(folder=Path("elsewhere"))).digest() == digest
     assert Config(run=RunConfig(seed=2)).digest() != digest
+
+
+@pytest.mark.parametrize("name", ["2024", "007", "on", "1e3", "v1.10", "2024-01-01", "1_000"])
+def test_a_name_is_the_text_that_was_written(tmp_path: Path, name: str) -> None:
+    path = written(tmp_path, f"run: {{name: {name}}}")
+    config = load_config(path)
+    assert config.run.name == name
+    assert load_config(None, [f"run.name={name}"]) == config
+    config.save(path)
+    assert load_config(path) == config
+
+
+def test_numbers_are_read_as_yaml_1_2_says(tmp_path: Path) -> None:
+    text = "learner: {rate: 1e-3, epochs: 010, warmup_epochs: 0x10}\nsimulator: {backend: 12:30:45}"
+    config = load_config(written(tmp_path, text), ["learner.batch=010", "learner.clip_norm=2E-1"])
+    learner = config.learner
+    assert (learner.rate, learner.epochs, learner.warmup_epochs) == (1e-3, 10, 16)
+    assert (learner.batch, learner.clip_norm) == (10, 0.2)
+    assert config.simulator.backend == "12:30:45"
+
+
+def test_an_empty_section_means_its_defaults(tmp_path: Path) -> None:
+    text = "learner:\nnetwork:\n  pfc:\n  mtrnn_slow: {tau: 12}\nrun:\n"
+    config = load_config(written(tmp_path, text), ["tutor=", "run.seed=3"])
+    assert config.learner == Config().learner
+    assert config.network.pfc == Config().network.pfc
+    assert (config.network.mtrnn_slow.units, config.network.mtrnn_slow.tau) == (30, 12)
+    assert config.run == RunConfig(seed=3)
+    assert load_config(written(tmp_path, "")) == Config()
+
+
+def test_a_folder_may_start_at_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/somebody")
+    assert load_config(None, ["run.folder=~/runs"]).run.folder == Path("/home/somebody/runs")
+
+
+@pytest.mark.parametrize("seed", ["-1", "4294967296", "one", "1.0", "\u0663"])
+@pytest.mark.parametrize("words", ["evaluate --policy=tutor --seed", "tutor --out=x --seed"])
+def test_a_seed_that_cannot_be_is_refused(
+    capsys: pytest.CaptureFixture[str], words: str, seed: str
+) -> None:
+    *command, option = words.split()
+    with pytest.raises(SystemExit) as ended:
+        main([*command, f"{option}={seed}"])
+    assert ended.value.code == 2
+    assert "is not an integer from 0 to 4294967295" in capsys.readouterr().err

@@ -1,14 +1,15 @@
-"""What is in the outbox arrives, or stays in the outbox."""
+"""What is in the outbox arrives, is refused, or stays; nothing holds up the rest."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from processes import eventually
 
 from proto.codec import Wire
-from proto.outbox import IN_FLIGHT, Outbox
+from proto.outbox import IN_FLIGHT, RESEND_AFTER_AT_MOST_S, Outbox
+
+AFTER_S = 5.0
 
 
 class Link:
@@ -20,93 +21,182 @@ class Link:
     def __call__(self, key: str, wire: Wire) -> None:
         self.sent.append((key, wire))
 
-    @property
-    def payloads(self) -> list[bytes]:
-        return [wire.payload for _, wire in self.sent]
+    def take(self) -> list[str]:
+        """Contents of what was sent since the last call."""
+        sent, self.sent = self.sent, []
+        return [wire.payload.decode() for _, wire in sent]
+
+
+class Clock:
+    """A clock that is set by hand."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
 
 
 def wire(content: str) -> Wire:
     return Wire("application/msgpack;vmdnn.test.1", content.encode())
 
 
+@pytest.fixture
+def link() -> Link:
+    return Link()
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def outbox(tmp_path: Path, link: Link, clock: Clock) -> Outbox:
+    return Outbox(tmp_path, link, resend_after_s=AFTER_S, clock=clock)
+
+
+def fill(outbox: Outbox, first: str, count: int) -> list[str]:
+    names = [f"{first}{number:02d}" for number in range(count)]
+    for name in names:
+        outbox.add(name, "key", wire(name))
+    return names
+
+
+def suffixes(folder: Path) -> list[str]:
+    return sorted(path.suffix for path in folder.iterdir())
+
+
 def test_what_is_added_is_on_disk_before_it_is_sent(tmp_path: Path) -> None:
     def look(_key: str, _wire: Wire) -> None:
-        assert [path.suffix for path in tmp_path.iterdir()] == [".message"]
-        looked.append(True)
+        seen.append(suffixes(tmp_path))
 
-    looked: list[bool] = []
+    seen: list[list[str]] = []
     Outbox(tmp_path, look).add("a", "key/of/a", wire("content\n\x00of a"))
-    assert looked == [True]
+    assert seen == [[".message"]]
 
 
-def test_it_is_sent_again_until_its_receipt_comes(tmp_path: Path) -> None:
-    link = Link()
-    outbox = Outbox(tmp_path, link, resend_after_s=0.0)
+def test_it_is_sent_again_later_each_time_until_its_receipt_comes(
+    outbox: Outbox, link: Link, clock: Clock, tmp_path: Path
+) -> None:
     outbox.add("a", "key/of/a", wire("content\n\x00of a"))
-    outbox.send_due()
-    outbox.send_due()
-    assert link.sent == [("key/of/a", wire("content\n\x00of a"))] * 3
+    for pause_s in (AFTER_S, 2 * AFTER_S, 4 * AFTER_S, *[RESEND_AFTER_AT_MOST_S] * 3):
+        assert link.sent == [("key/of/a", wire("content\n\x00of a"))]
+        link.take()
+        clock.now_s += pause_s - 0.1
+        outbox.send_due()
+        assert link.take() == []
+        clock.now_s += 0.1
+        outbox.send_due()
+    link.take()
     outbox.received("a")
     outbox.received("a")
     outbox.received("never heard of")
+    clock.now_s += 1000.0
     outbox.send_due()
-    assert len(link.sent) == 3
+    assert link.take() == []
     assert len(outbox) == 0
     assert list(tmp_path.iterdir()) == []
 
 
-def test_it_is_not_sent_again_at_once(tmp_path: Path) -> None:
-    link = Link()
-    outbox = Outbox(tmp_path, link, resend_after_s=0.2)
-    outbox.add("a", "key", wire("a"))
-    outbox.send_due()
-    assert len(link.sent) == 1
-
-    def sent_again() -> bool:
-        outbox.send_due()
-        return len(link.sent) == 2
-
-    eventually(sent_again, "it is due again")
-
-
-def test_a_new_process_finds_what_the_old_one_left_in_order(tmp_path: Path) -> None:
+def test_a_new_process_finds_what_the_old_one_left_in_order(tmp_path: Path, link: Link) -> None:
     old = Outbox(tmp_path, Link())
     for name in "abc":
         old.add(f"episode-{name}", "key", wire(name))
     old.received("episode-b")
-    (tmp_path / "1-episode-d.unfinished").write_bytes(b"{")  # killed while writing
-    link = Link()
+    (tmp_path / "1-episode-d.message.0123abcd.part").write_bytes(b"{")  # killed while writing
     new = Outbox(tmp_path, link)
     assert len(new) == 2
+    assert suffixes(tmp_path) == [".message", ".message"]
     new.send_due()
-    assert link.payloads == [b"a", b"c"]
+    assert link.take() == ["a", "c"]
     new.received("episode-a")
     assert len(Outbox(tmp_path, Link())) == 1
 
 
-def test_the_oldest_go_first_and_not_all_at_once(tmp_path: Path) -> None:
-    link = Link()
-    outbox = Outbox(tmp_path, link)
-    names = [f"{number:02d}" for number in range(IN_FLIGHT + 3)]
-    for name in names:
-        outbox.add(name, "key", wire(name))
-    assert link.payloads == [name.encode() for name in names[:IN_FLIGHT]]
+def test_the_oldest_go_first_and_not_all_at_once(outbox: Outbox, link: Link) -> None:
+    names = fill(outbox, "m", IN_FLIGHT + 3)
+    assert link.take() == names[:IN_FLIGHT]
     outbox.received(names[0])
     outbox.send_due()
-    assert link.payloads[-1] == names[IN_FLIGHT].encode()
+    assert link.take() == [names[IN_FLIGHT]], "an answer makes room for the next"
 
 
-def test_a_damaged_file_is_put_aside(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_messages_that_nobody_answers_hold_up_no_others(
+    outbox: Outbox, link: Link, clock: Clock
+) -> None:
+    unanswered = fill(outbox, "unanswered", IN_FLIGHT)
+    good = fill(outbox, "good", 2)
+    assert link.take() == unanswered
+    clock.now_s += AFTER_S
+    outbox.send_due()
+    sent = link.take()
+    assert sent[:2] == good
+    assert sent[2:] == unanswered[: IN_FLIGHT - 2], "the window is full, and no fuller"
+    for name in good:
+        outbox.received(name)
+    outbox.send_due()
+    link.take()
+    for second in range(100):  # from then on they are rarely sent, also while others are answered
+        clock.now_s += 1.0
+        if second % 10 == 0:
+            outbox.add(f"other{second}", "key", wire("other"))
+            outbox.received(f"other{second}")
+        outbox.send_due()
+    assert len([sent for sent in link.take() if sent != "other"]) < 6 * IN_FLIGHT
+    clock.now_s += RESEND_AFTER_AT_MOST_S
+    outbox.send_due()
+    outbox.add("new", "key", wire("new"))
+    clock.now_s += AFTER_S
+    outbox.send_due()
+    assert "new" in link.take()
+    assert len(outbox) == IN_FLIGHT + 1
+
+
+def test_when_the_receiver_is_back_everything_is_sent_soon(
+    outbox: Outbox, link: Link, clock: Clock
+) -> None:
+    names = fill(outbox, "m", 3)
+    for _ in range(10):
+        clock.now_s += RESEND_AFTER_AT_MOST_S
+        outbox.send_due()
+    link.take()
+    clock.now_s += AFTER_S
+    outbox.received(names[1])
+    outbox.send_due()
+    assert link.take() == [names[0], names[2]]
+
+
+def test_what_is_refused_is_put_aside_and_never_sent_again(
+    outbox: Outbox, link: Link, clock: Clock, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    refused = fill(outbox, "refused", IN_FLIGHT)
+    good = fill(outbox, "good", 1)
+    link.take()
+    for name in refused:
+        outbox.refused(name, "of another task")
+    outbox.send_due()
+    assert link.take() == good
+    assert (len(outbox), outbox.put_aside) == (1, IN_FLIGHT)
+    outbox.refused(refused[0], "of another task")
+    assert outbox.put_aside == IN_FLIGHT
+    assert "was refused: of another task" in caplog.text
+    clock.now_s += 1000.0
+    outbox.send_due()
+    assert link.take() == good
+    assert suffixes(tmp_path) == [".message", *[".refused"] * IN_FLIGHT]
+    again = Outbox(tmp_path, link)
+    assert (len(again), again.put_aside) == (1, IN_FLIGHT)
+
+
+def test_a_damaged_file_is_put_aside(
+    tmp_path: Path, link: Link, caplog: pytest.LogCaptureFixture
+) -> None:
     (tmp_path / "1-a.message").write_bytes(b"\x00\x01\x02")
     (tmp_path / "2-b.message").write_bytes(b'{"key": 3}\nrest')
-    link = Link()
     outbox = Outbox(tmp_path, link)
     outbox.add("c", "key", wire("c"))
-    assert link.payloads == [b"c"]
-    assert len(outbox) == 1
-    assert sorted(path.suffix for path in tmp_path.iterdir()) == [
-        ".damaged",
-        ".damaged",
-        ".message",
-    ]
-    assert "put aside" in caplog.text
+    assert link.take() == ["c"]
+    assert (len(outbox), outbox.put_aside) == (1, 2)
+    assert suffixes(tmp_path) == [".damaged", ".damaged", ".message"]
+    assert "is damaged" in caplog.text

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from ports import free_endpoint
+from processes import run_vmdnn, stop, vmdnn
 
 from proto.bus import Bus, open_bus, open_hub
 from proto.config import HubConfig
@@ -34,21 +33,17 @@ def hub() -> Iterator[HubConfig]:
         yield config
 
 
-@contextmanager
-def recorder(hub: HubConfig, folder: Path, *settings: str) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "services.cli", "recorder", "--connect", hub.endpoint]
+def recorder(
+    hub: HubConfig, folder: Path, *settings: str
+) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    words = ["--connect", hub.endpoint]
     for setting in (f"run.folder={folder}", f"run.name={RUN}", *settings):
-        command += ["--set", setting]
-    process = subprocess.Popen(command)
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
+        words += ["--set", setting]
+    return vmdnn("recorder", *words)
 
 
 class Listener:
-    """What the recorder tells about itself."""
+    """Receives the recorder's metrics."""
 
     def __init__(self, bus: Bus) -> None:
         self._told: RecorderMetrics | None = None
@@ -56,7 +51,7 @@ class Listener:
         bus.subscribe(bus.keys.metrics(Role.RECORDER), self._listen, RecorderMetrics)
 
     def wait_for(self, ready: Callable[[RecorderMetrics], bool]) -> RecorderMetrics:
-        """The first metrics that are as they should be."""
+        """The first metrics for which `ready` holds."""
 
         def told() -> bool:
             return self._told is not None and ready(self._told)
@@ -109,8 +104,7 @@ def test_every_rollout_is_kept_once(
         kept = read_episode(tmp_path / RUN / "rollouts" / "rollout3.mcap")
         assert np.array_equal(kept.images, sent[3].episode.images)
         assert kept.outcome == sent[3].episode.outcome
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(timeout=30) == 0
+        assert stop(process) == 0
 
 
 def test_a_restarted_recorder_carries_on_and_keeps_trials_only_if_told(
@@ -133,15 +127,7 @@ def test_a_restarted_recorder_carries_on_and_keeps_trials_only_if_told(
 
 
 def test_without_a_hub_it_says_so(tmp_path: Path) -> None:
-    result = subprocess.run(
-        [
-            *(sys.executable, "-m", "services.cli", "recorder", "--connect", free_endpoint()),
-            *("--set", f"run.folder={tmp_path}"),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
+    words = ("--connect", free_endpoint(), "--set", f"run.folder={tmp_path}")
+    result = run_vmdnn("recorder", *words)
     assert result.returncode == 2
     assert "no hub answers" in result.stderr

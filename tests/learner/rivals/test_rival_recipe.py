@@ -30,6 +30,7 @@ from learner.tutoring.store import TutoringStore
 from proto.config import Config, RivalKind
 from proto.episode import Episode
 from proto.errors import UserError
+from proto.variables import Question
 
 KINDS = get_args(RivalKind)
 
@@ -180,4 +181,4 @@ def test_foreign_and_damaged_networks_are_refused(
     with pytest.raises(UserError, match="cnn-lstm with 12 units, not feed-forward with 12 units"):
         train(tmp_path, "feed-forward", store)
     with pytest.raises(UserError, match="cnn-lstm with 12 units, not VMDNN"):
-        open_training(make_recipe(config(), None), tmp_path, store)
+        open_training(make_recipe(config(), None, [Question("object_y_m", 3)]), tmp_path, store)

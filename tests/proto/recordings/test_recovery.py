@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import eventually
 
 from proto.episode import Episode
 from proto.errors import UserError
@@ -108,13 +108,13 @@ write_episode(Path({str(target)!r}), replace(episode, **arrays))
 
 
 def _wait_for_part(target: Path, process: subprocess.Popen[bytes], size: int) -> Path:
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and process.poll() is None:
-        for part in target.parent.glob(f"{target.name}.*.part"):
-            if part.stat().st_size > size:
-                return part
-        time.sleep(0.01)
-    raise AssertionError("the other process never wrote enough")
+    def long_enough() -> list[Path]:
+        assert process.poll() is None, "the other process ended too early"
+        parts = target.parent.glob(f"{target.name}.*.part")
+        return [part for part in parts if part.stat().st_size > size]
+
+    eventually(lambda: bool(long_enough()), "the other process has written enough")
+    return long_enough()[0]
 
 
 def test_a_repaired_episode_is_not_taken_for_a_whole_one(recording: bytes, tmp_path: Path) -> None:

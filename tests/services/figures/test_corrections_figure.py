@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from actors.tasks.registry import make_pretraining_task
 from learner.checkpoint import policy_file
 from learner.training.trainer import Trainer
 from learner.training.training_run import policy_is_due, write_policy
@@ -36,7 +37,7 @@ def run(recordings: Path, tmp_path: Path) -> Path:
     store = TutoringStore(folder / "tutoring")
     shown = store.load(store.ids[0])
     assert shown is not None
-    trainer = Trainer(VMDNNRecipe(config), store, rounds=2)
+    trainer = Trainer(VMDNNRecipe(config, make_pretraining_task(config).questions), store, rounds=2)
     while not trainer.finished:
         if trainer.round_begins:
             situation = {**shown.situation, "object_y_m": 0.2 + 0.01 * trainer.round}

@@ -1,0 +1,91 @@
+"""File locks in a run's folder: no two processes on this machine are the same participant."""
+
+from __future__ import annotations
+
+import fcntl
+import itertools
+import re
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from proto.errors import UserError
+from proto.keys import Role
+from proto.storage import make_folder, storage_errors
+
+
+@contextmanager
+def only_one(run_folder: Path, role: Role, name: str) -> Iterator[None]:
+    """Hold the lock of a role and a name in a run's folder until the context ends.
+
+    Raises:
+        UserError: another process holds it.
+    """
+    with _lock(run_folder, role, name) as held:
+        if not held:
+            raise UserError(
+                f"{role.with_article} with the id {name!r} already works in {run_folder}: stop it, "
+                "or choose another --id or run"
+            )
+        yield
+
+
+@contextmanager
+def single_process(run_folder: Path, role: Role, wanted: str | None) -> Iterator[str]:
+    """Be the only process of a role in a run's folder, whatever its id; gives the id.
+
+    Args:
+        run_folder: the run's folder.
+        role: role of this process.
+        wanted: id of this process; None: the name of the role.
+
+    Raises:
+        UserError: another process of this role works in the folder.
+    """
+    with only_one(run_folder, role, role.value):
+        yield wanted or role.value
+
+
+@contextmanager
+def own_id(run_folder: Path, role: Role, wanted: str | None) -> Iterator[str]:
+    """Reserve an id that no other process of this role in the run's folder has; gives the id.
+
+    Without a wanted id it is the first free one of HOST-1, HOST-2, ...: a restarted process gets
+    the id of its predecessor, and finds the files that the predecessor left.
+
+    Raises:
+        UserError: another process has the wanted id.
+    """
+    if wanted is not None:
+        with only_one(run_folder, role, wanted):
+            yield wanted
+        return
+    host = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40] or "host"
+    for number in itertools.count(1):
+        with _lock(run_folder, role, f"{host}-{number}") as held:
+            if held:
+                yield f"{host}-{number}"
+                return
+
+
+@contextmanager
+def _lock(run_folder: Path, role: Role, name: str) -> Iterator[bool]:
+    """Try to lock; gives whether this process holds the lock.
+
+    The operating system frees the lock of a process that dies.
+
+    Raises:
+        UserError: the lock's file cannot be made.
+    """
+    path = run_folder / "locks" / f"{role}-{name}"
+    make_folder(path.parent)
+    with storage_errors(path):
+        file = path.open("ab")
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+            return
+        yield True

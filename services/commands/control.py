@@ -1,0 +1,55 @@
+"""`vmdnn control`: pause, resume, checkpoint or stop the processes of a role."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from typing import Final
+
+from proto.bus import open_bus
+from proto.codec import encode
+from proto.keys import Role
+from proto.messages import Command, Control, ControlReply
+from services.arguments.common import add_connection, config_of
+
+ROLES: Final = tuple(role for role in Role if role is not Role.WATCH)
+"""Roles whose processes answer control messages."""
+ANSWER_WITHIN_S: Final = 60.0
+"""A checkpoint is written after the epoch that is going on, which takes its time."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("role", choices=[role.value for role in ROLES], help="all of this role")
+    parser.add_argument("do", choices=[command.value for command in Command], help="what to do")
+    add_connection(parser)
+    parser.add_argument("--json", action="store_true", help="print the answers as JSON")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Send the command and print the answer of each process; 1 if none answers."""
+    config = config_of(arguments)
+    role, control = Role(arguments.role), Control(Command(arguments.do))
+    with open_bus(config.hub, config.run.name, Role.WATCH, f"control-{os.getpid()}") as bus:
+        replies = bus.ask(bus.keys.control(role), control, ControlReply, timeout_s=ANSWER_WITHIN_S)
+    if not replies:
+        print(
+            f"no {role} of run {config.run.name!r} answers; `vmdnn watch --once` shows the "
+            "processes of a run. Choose another run with --set run.name=NAME or "
+            "--config RUN/config.yaml",
+            file=sys.stderr,
+        )
+        return 1
+    _show(sorted(replies, key=lambda reply: reply.id), as_json=arguments.json)
+    return 0
+
+
+def _show(replies: Sequence[ControlReply], *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps([json.loads(encode(reply).payload) for reply in replies], indent=2))
+        return
+    for reply in replies:
+        print(f"{reply.role} {reply.id}: {reply.note}")

@@ -1,0 +1,89 @@
+"""The state of a run as tables."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from rich.console import Group, RenderableType
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from proto.metrics import ActorMetrics, LearnerMetrics, PolicyScore, RecorderMetrics
+from services.board import RunView
+from services.terminal.run_words import actors_words, stage_words, success_words
+
+ROWS_SHOWN: Final = 12
+"""A table shows no more actors, and no more policy versions."""
+
+
+def run_tables(view: RunView) -> RenderableType:
+    """The state of a run as tables."""
+    parts: list[RenderableType] = [Text(f"run {view.run}", style="bold")]
+    parts += [_learner_table(learner) for learner in view.living(LearnerMetrics)]
+    parts.append(_actors_table(view.living(ActorMetrics)))
+    if view.scores:
+        parts.append(_scores_table(view.scores))
+    parts += [
+        Text(f"recorder {m.id}: {m.episodes} episodes, {m.bytes / 1e6:.1f} MB, {m.dropped} dropped")
+        for m in view.living(RecorderMetrics)
+    ]
+    parts += [
+        Text(f"{role} {name} is gone for {time.time() - since_s:.0f} s", style="red")
+        for (role, name), since_s in sorted(view.vanished_s.items())
+    ]
+    return Group(*parts)
+
+
+def _learner_table(learner: LearnerMetrics) -> Table:
+    table = Table("learner", "stage", "epoch", "", "loss", "sequences", "epochs/s", "policy")
+    table.add_row(
+        learner.id,
+        "paused" if learner.paused else stage_words(learner),
+        f"{learner.epoch}/{learner.epochs_total}",
+        ProgressBar(total=max(learner.epochs_total, 1), completed=learner.epoch, width=20),
+        "" if learner.loss is None else f"{learner.loss:.4f}",
+        str(learner.sequences),
+        f"{learner.epochs_per_s:.1f}",
+        str(learner.policy_version),
+    )
+    return table
+
+
+def _actors_table(actors: Sequence[ActorMetrics]) -> Table:
+    table = Table("actor", "policy", "steps/s", "episodes", "last episode", "outbox", "simulator")
+    for actor in actors[:ROWS_SHOWN]:
+        last = f"{actor.last_kind}: {actor.last_outcome}" if actor.last_kind else ""
+        table.add_row(
+            actor.id,
+            str(actor.policy_version),
+            f"{actor.steps_per_s:.1f}",
+            str(actor.episodes),
+            "paused" if actor.paused else last,
+            _outbox_words(actor),
+            actor.backend,
+        )
+    if len(actors) > ROWS_SHOWN:
+        table.caption = f"and {len(actors) - ROWS_SHOWN} more; all: {actors_words(actors)}"
+    return table
+
+
+def _outbox_words(actor: ActorMetrics) -> str:
+    """Such as `2`, or `2, 1 put aside`."""
+    aside = f", {actor.put_aside} put aside" if actor.put_aside else ""
+    return f"{actor.outbox}{aside}"
+
+
+def _scores_table(scores: Sequence[PolicyScore]) -> Table:
+    table = Table("policy", "trials", "lenient", "strict", "precise", "not precise because")
+    for score in reversed(scores[-ROWS_SHOWN:]):
+        reasons = sorted(score.reasons.items(), key=lambda item: -item[1])
+        table.add_row(
+            str(score.version),
+            str(score.trials),
+            *(success_words(s, score.trials) for s in (score.lenient, score.strict, score.precise)),
+            ", ".join(f"{reason} {count}" for reason, count in reasons if reason != "none"),
+        )
+    return table
