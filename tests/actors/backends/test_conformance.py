@@ -16,12 +16,14 @@ import pytest
 
 from actors.backends import light
 from actors.simulator import (
+    DARK_SCREEN,
     ROBOT,
     Box,
     Crop,
     JointTargets,
     Pose,
     Scene,
+    Screen,
     Simulator,
     load_backend,
     make_simulator,
@@ -296,7 +298,7 @@ def test_a_recorded_state_can_be_shown_again(seeing):
     picture = seeing.eye_picture(Crop(), 160, 120)
     seeing.reset(scene())
     assert np.abs(seeing.eye_picture(Crop(), 160, 120).astype(int) - picture).mean() > 2.0
-    seeing.show(joints, {name: bodies[name] for name in ("table", "obstacle", "object")})
+    seeing.show(joints, {name: bodies[name] for name in ("table", "obstacle", "object")}, 8)
     assert np.abs(seeing.eye_picture(Crop(), 160, 120).astype(int) - picture).mean() < 0.5
     for name in ("r_hand_dh_frame", "object", "head"):
         assert seeing.bodies()[name].position_m == pytest.approx(bodies[name].position_m, abs=1e-3)
@@ -321,6 +323,71 @@ def test_a_surface_is_as_bright_as_the_shared_light_says(seeing, normal, quatern
     row, column = seen_at(seeing, centre + 0.005 * np.array(normal), 640, 480)
     expected = light.brightness(np.array(normal, dtype=float)) * np.array(colour)
     assert picture[row, column] == pytest.approx(255 * expected ** (1 / light.GAMMA), abs=1.5)
+
+
+QUARTERS = np.kron(np.array([[40, 90], [140, 190]]), np.ones((48, 48))).astype(np.uint8)
+"""A frame whose quarters have other grey levels."""
+SCREEN = Screen((1.0, 0.8), Pose((0.05, 1.2, 0.4)), np.stack([QUARTERS, 255 - QUARTERS]))
+
+
+def looking_at_screen(simulator, screen=SCREEN):
+    start = targets(neck=(25.0, -2.0))
+    simulator.reset(replace(scene(TABLE, start=start), screen=screen))
+    return start
+
+
+def quarters_seen(simulator):
+    """Grey levels in the middle of the screen's quarters, (2, 2), upper left first."""
+    x, y, z = SCREEN.pose.position_m
+    return np.array(
+        [
+            [grey_at(simulator, (x + across, y, z + up)) for across in (-0.25, 0.25)]
+            for up in (0.2, -0.2)
+        ]
+    )
+
+
+def test_a_screen_shows_its_frames_upright_and_as_bright_as_they_are(seeing):
+    start = looking_at_screen(seeing)
+    np.testing.assert_allclose(quarters_seen(seeing), [[40, 90], [140, 190]], atol=1.0)
+    seeing.step(start)
+    np.testing.assert_allclose(quarters_seen(seeing), [[215, 165], [115, 65]], atol=1.0)
+
+
+def test_a_screen_has_the_size_and_place_that_the_scene_says(seeing):
+    looking_at_screen(seeing, replace(SCREEN, frames=np.full((1, 8, 8), 250, dtype=np.uint8)))
+    x, y, z = SCREEN.pose.position_m
+    for across, up in ((0.47, 0.0), (-0.47, 0.0), (0.0, 0.37), (0.0, -0.37)):
+        assert grey_at(seeing, (x + across, y, z + up)) > 240.0
+        assert grey_at(seeing, (x + across * 1.13, y, z + up * 1.16)) < 150.0
+
+
+def test_a_screen_is_dark_after_its_last_frame(seeing):
+    start = looking_at_screen(seeing)
+    for _ in range(2):
+        seeing.step(start)
+    np.testing.assert_allclose(quarters_seen(seeing), DARK_SCREEN, atol=1.0)
+
+
+def test_a_screen_begins_anew_with_the_scene_and_goes_with_it(seeing):
+    start = looking_at_screen(seeing)
+    seeing.step(start)
+    looking_at_screen(seeing)
+    np.testing.assert_allclose(quarters_seen(seeing), [[40, 90], [140, 190]], atol=1.0)
+    seeing.reset(scene(TABLE, start=start))
+    assert np.ptp(quarters_seen(seeing)) < 2.0
+
+
+def test_a_recorded_step_of_a_screen_can_be_shown_again(seeing):
+    looking_at_screen(seeing)
+    seeing.show(seeing.joints_deg(), {}, 1)
+    np.testing.assert_allclose(quarters_seen(seeing), [[215, 165], [115, 65]], atol=1.0)
+
+
+def test_nothing_is_rendered_for_a_screen_that_nobody_sees(blind):
+    start = looking_at_screen(blind)
+    blind.step(start)
+    assert (blind.observe(Crop()).image == 0).all()
 
 
 def share_of(picture, red, green, blue):
