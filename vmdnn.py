@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import packages_distributions, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -105,8 +105,8 @@ def load_config(source: str | Path | None = None, overrides: Sequence[str] = ())
     Raises:
         UserError: there is no such file, or a value is wrong.
     """
-    from services.arguments.common import config_file  # noqa: PLC0415
     from proto.config import load_config as load  # noqa: PLC0415
+    from services.arguments.common import config_file  # noqa: PLC0415
 
     return load(None if source is None else config_file(str(source)), overrides)
 
@@ -217,6 +217,42 @@ def tutor(
     for _ in record(config, jobs, out, workers=workers):
         pass
     return sorted(out.glob("*.mcap"))
+
+
+def train(
+    data: str | Path,
+    out: str | Path,
+    config: Config | None = None,
+    on_epoch: Callable[[float], None] = lambda _: None,
+) -> Path:
+    """Train VMDNN on recorded sequences; a training that was stopped goes on where it was.
+
+    Args:
+        data: folder of tutored sequences.
+        out: folder of the run; gets checkpoints and policies.
+        config: everything the training depends on; without it, all defaults.
+        on_epoch: called with the loss after each epoch.
+
+    Returns:
+        The file of the newest policy.
+    """
+    from actors.tasks.registry import make_task as make  # noqa: PLC0415
+    from learner.checkpoint import policy_file  # noqa: PLC0415
+    from learner.training.training_run import open_training, run_training  # noqa: PLC0415
+    from learner.training.vmdnn_recipe import VMDNNRecipe  # noqa: PLC0415
+    from learner.tutoring.store import TutoringStore  # noqa: PLC0415
+    from proto.config import Config as Default  # noqa: PLC0415
+
+    config, folder = config or Default(), Path(out)
+    recipe = VMDNNRecipe(config, make(config.task).questions)
+    trainer = open_training(recipe, folder, TutoringStore(Path(data)))
+
+    def go_on(loss: float) -> bool:
+        on_epoch(loss)
+        return True
+
+    run_training(trainer, folder, go_on)
+    return policy_file(folder, trainer.version)
 
 
 def evaluate(

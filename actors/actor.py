@@ -1,4 +1,4 @@
-"""The actor on the bus: plays what is asked for with the newest policy, and loses nothing."""
+"""The actor on the bus: plays the episodes that learner and evaluator ask for."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 import secrets
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -30,6 +30,7 @@ from proto.lifecycle import Lifecycle
 from proto.membership import membership
 from proto.messages import (
     Correction,
+    EpisodeFailed,
     Live,
     PolicyVersion,
     Receipt,
@@ -50,11 +51,12 @@ from proto.variables import Situation
 LOG = logging.getLogger(__name__)
 
 IDLE_S: Final = 0.3
+"""How long to wait before asking again, when there is nothing to play."""
 OUTBOX_PERIOD_S: Final = 1.0
 OUTBOX_LIMIT: Final = 100
-"""With so many episodes without a receipt it plays no more for whom they are."""
+"""An actor plays no more for a receiver that owes it so many receipts."""
 PRACTICE_LIMIT: Final = 8
-"""With so many rollouts without a receipt it does not practise."""
+"""An actor does not practise when so many rollouts are without a receipt."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,12 @@ class Assignment:
     """An episode to play.
 
     Attributes:
-        kind: why.
-        task: what is played.
-        policy: who acts.
-        situation: in which situation.
+        kind: why it is played.
+        task: the task.
+        policy: the policy that acts.
+        situation: the situation.
         seed: seed of the episode.
+        training: id of the training that the policy comes from, empty for the tutor.
     """
 
     kind: Kind
@@ -74,10 +77,11 @@ class Assignment:
     policy: Policy
     situation: Situation
     seed: int
+    training: str = ""
 
 
 def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
-    """What is told to whoever watches, in every control step."""
+    """The message that is published in every control step while anyone watches."""
     return Live(
         actor=actor,
         kind=assignment.kind,
@@ -95,14 +99,23 @@ class _StoppedError(Exception):
     """The episode is given up because the actor should stop."""
 
 
+class _SimulationError(Exception):
+    """The episode cannot be used: the simulation gave values that cannot be."""
+
+
 class Actor:
-    """Takes newer policies between episodes only: a recurrent state never crosses a change."""
+    """Plays one episode after another, and keeps each on disk until its receipt comes.
+
+    It takes a newer policy only between two episodes, because the recurrent state of one policy
+    means nothing to another.
+    """
 
     def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
-        """Make the simulator and find what a former process with this id left to be sent.
+        """Make the simulator, and find the messages that a former process with this id left.
 
         Raises:
-            UserError: the simulator cannot run on this machine.
+            UserError: the simulator cannot run on this machine, or the run's folder cannot be
+                written.
         """
         self._config = config
         self._bus = bus
@@ -122,10 +135,15 @@ class Actor:
         self._offering = threading.Lock()
         self._pace = Pace()
         self._episodes = 0
+        self._failed = 0
         self._last: Episode | None = None
 
     def run(self) -> None:
-        """Play until it should stop; an episode that is going on then is given up."""
+        """Play until it should stop; the episode that is played then is given up.
+
+        Raises:
+            UserError: an episode cannot be written to disk.
+        """
         keys = self._bus.keys
         self._bus.subscribe(keys.receipt(self._bus.id), self._on_receipt, Receipt)
         self._bus.subscribe_newest(keys.policy, self._on_policy, PolicyVersion)
@@ -141,7 +159,7 @@ class Actor:
             self._simulator.close()
 
     def metrics(self) -> ActorMetrics:
-        """What it tells about itself."""
+        """Metrics at this moment."""
         last = self._last
         return ActorMetrics(
             id=self._bus.id,
@@ -154,11 +172,13 @@ class Actor:
             last_kind=last.kind if last else None,
             backend=self._simulator.name,
             outbox=self._waiting,
+            put_aside=self._sequences.put_aside + self._rollouts.put_aside,
+            failed=self._failed,
             paused=self._lifecycle.paused,
         )
 
     def checkpoint(self) -> str:
-        """Nothing is to be saved: finished episodes are on disk until their receipts come."""
+        """Write nothing: finished episodes are on disk until their receipts come."""
         return f"{self._waiting} episodes wait for their receipts on disk"
 
     @property
@@ -175,14 +195,18 @@ class Actor:
             return
         try:
             episode = self._play(assignment)
+            self._send(episode)
         except _StoppedError:
+            return
+        except _SimulationError as error:
+            self._failed += 1
+            self._report_failure(assignment, str(error))
             return
         self._episodes += 1
         self._last = episode
-        self._send(episode)
 
     def _tutoring(self) -> Assignment | None:
-        """A case that the learner wants to be shown, or a situation to be guided in."""
+        """A tutored case or a correction that the learner asks for; None if there is none."""
         if len(self._sequences) >= OUTBOX_LIMIT:
             return None
         version = self._policy.version if self._policy else 0
@@ -196,11 +220,15 @@ class Actor:
                     return self._guidance(answer)
                 return self._demonstration(answer)
             except UserError as error:
-                LOG.warning("what the learner asks for is not played: %s", error)
+                LOG.warning("the learner's request cannot be played: %s", error)
         return None
 
     def _demonstration(self, asked: TutoringCase) -> Assignment:
-        """Show a tutored case; UserError if there is none such."""
+        """A demonstration of a tutored case.
+
+        Raises:
+            UserError: there is no such case.
+        """
         task = self._task_called(asked.task)
         situations = task.tutored()
         if asked.case >= len(situations):
@@ -209,14 +237,20 @@ class Actor:
         return Assignment(Kind.TUTORING, task, tutor, situations[asked.case], asked.seed)
 
     def _guidance(self, asked: Correction) -> Assignment:
-        """Guide the policy at hand; UserError if the situation cannot be."""
+        """A correction: the policy acts and the tutor guides it.
+
+        Raises:
+            UserError: there is no policy, or the situation is not one of the task.
+        """
         task = self._task_called(asked.task)
         task.check(asked.situation)
         if self._policy is None:
             raise UserError("there is no policy to be guided")
         tutor = make_tutor(task)
         guided = GuidedPolicy(self._policy, tutor, self._config.tutor.guidance_deg)
-        return Assignment(Kind.CORRECTION, task, guided, asked.situation, asked.seed)
+        return Assignment(
+            Kind.CORRECTION, task, guided, asked.situation, asked.seed, self._policy_run
+        )
 
     def _task_called(self, name: str) -> Task:
         if name not in self._tasks:
@@ -224,24 +258,28 @@ class Actor:
         return self._tasks[name]
 
     def _trial(self) -> Assignment | None:
-        """A trial of the policy at hand that the evaluator wants."""
+        """A trial of this policy that the evaluator asks for; None if there is none."""
         if self._policy is None or len(self._rollouts) >= OUTBOX_LIMIT:
             return None
         request = TrialRequest(self._bus.id, self._policy_run, self._policy.version)
         for trial in self._bus.ask(self._bus.keys.request_trial, request, Trial):
             situation = self._task.sample(trial.seed)
-            return Assignment(Kind.TRIAL, self._task, self._policy, situation, trial.seed)
+            return Assignment(
+                Kind.TRIAL, self._task, self._policy, situation, trial.seed, self._policy_run
+            )
         return None
 
     def _practice(self) -> Assignment | None:
-        """A situation of its own choice."""
+        """A random situation; None without a policy, or if practice is off or ahead of receipts."""
         if self._policy is None or not self._config.actor.practice:
             return None
         if len(self._rollouts) >= PRACTICE_LIMIT:
             return None
         seed = secrets.choice(PRACTICE)
         situation = self._task.sample(seed)
-        return Assignment(Kind.PRACTICE, self._task, self._policy, situation, seed)
+        return Assignment(
+            Kind.PRACTICE, self._task, self._policy, situation, seed, self._policy_run
+        )
 
     def _play(self, assignment: Assignment) -> Episode:
         live_key = self._bus.keys.live(self._bus.id)
@@ -254,51 +292,98 @@ class Actor:
                 message = live_message(self._bus.id, assignment, live)
                 self._bus.publish(live_key, message, check=False)
 
-        return play(
-            self._simulator,
-            assignment.task,
-            assignment.policy,
-            assignment.situation,
-            seed=assignment.seed,
-            kind=assignment.kind,
-            actor=self._bus.id,
-            config_digest=self._digest,
-            on_step=on_step,
-        )
+        try:
+            episode = play(
+                self._simulator,
+                assignment.task,
+                assignment.policy,
+                assignment.situation,
+                seed=assignment.seed,
+                kind=assignment.kind,
+                actor=self._bus.id,
+                config_digest=self._digest,
+                on_step=on_step,
+            )
+        except (ArithmeticError, ValueError, RuntimeError) as error:
+            if self._simulation_is_finite():
+                raise
+            raise _SimulationError(f"{type(error).__name__}: {error}") from error
+        return replace(episode, training=assignment.training)
+
+    def _simulation_is_finite(self) -> bool:
+        joints, bodies = self._simulator.joints_deg(), self._simulator.bodies()
+        return bool(np.isfinite(joints).all() and np.isfinite(bodies.rows).all())
 
     def _send(self, episode: Episode) -> None:
+        """Put a finished episode into the outbox.
+
+        Raises:
+            _SimulationError: its values are not those of an episode, such as NaN.
+            UserError: it cannot be written to disk.
+        """
+        learned_from = episode.kind in (Kind.TUTORING, Kind.CORRECTION)
         keys, actor = self._bus.keys, self._bus.id
         try:
-            if episode.kind in (Kind.TUTORING, Kind.CORRECTION):
-                self._sequences.add(episode.id, keys.sequence(actor), encode(Sequence(episode)))
+            if learned_from:
+                wire = encode(Sequence(episode))
             else:
-                rollout = Rollout(episode, self._policy_run)
-                self._rollouts.add(episode.id, keys.rollout(actor), encode(rollout))
-        except MessageError as error:  # such as a simulation that blew up into NaN
-            LOG.warning("episode %s is dropped, nobody would take it: %s", episode.id, error)
+                wire = encode(Rollout(episode, episode.training))
+        except MessageError as error:
+            raise _SimulationError(str(error)) from error
+        if learned_from:
+            self._sequences.add(episode.id, keys.sequence(actor), wire)
+        else:
+            self._rollouts.add(episode.id, keys.rollout(actor), wire)
+
+    def _report_failure(self, failed: Assignment, problem: str) -> None:
+        """Tell the process that asked for the episode; nobody asks for practice."""
+        LOG.warning("the simulation of an episode (%s) failed: %s", failed.kind, problem)
+        if failed.kind is Kind.PRACTICE:
+            return
+        report = EpisodeFailed(
+            id=secrets.token_hex(16),
+            actor=self._bus.id,
+            kind=failed.kind,
+            task=failed.task.name,
+            seed=failed.seed,
+            situation=dict(failed.situation),
+            training=failed.training,
+            policy_version=failed.policy.version,
+            problem=ascii(problem)[1:-1][:1000],
+        )
+        outbox = self._rollouts if failed.kind is Kind.TRIAL else self._sequences
+        outbox.add(report.id, self._bus.keys.failure(self._bus.id), encode(report))
 
     def _on_receipt(self, receipt: Receipt) -> None:
-        self._sequences.received(receipt.episode)
-        self._rollouts.received(receipt.episode)
+        for outbox in (self._sequences, self._rollouts):
+            if receipt.refusal:
+                outbox.refused(receipt.episode, receipt.refusal)
+            else:
+                outbox.received(receipt.episode)
 
     def _on_policy(self, offered: PolicyVersion) -> None:
         with self._offering:
-            self._offered = offered
+            waiting = self._offered
+            if waiting is None or _is_newer(offered, waiting.run_id, waiting.version):
+                self._offered = offered
 
     def _take_newest_policy(self) -> None:
         with self._offering:
             offered, self._offered = self._offered, None
-        if offered is None:
-            return
-        held = self._policy.version if self._policy and offered.run_id == self._policy_run else 0
-        if offered.version <= held:
+        held = self._policy.version if self._policy else 0
+        if offered is None or not _is_newer(offered, self._policy_run, held):
             return
         try:
             checkpoint = checkpoint_from_bytes(offered.weights, "the policy")
             check_task(checkpoint, self._task.name, "the policy")
             self._policy = NetworkPolicy(checkpoint, "the policy")
         except UserError as error:
-            LOG.warning("policy %d is not taken: %s", offered.version, error)
+            LOG.warning("policy %d cannot be used: %s", offered.version, error)
             return
         self._policy_run = offered.run_id
         LOG.info("acts with policy %d from now on", self._policy.version)
+
+
+def _is_newer(offered: PolicyVersion, run_id: str, version: int) -> bool:
+    """Whether a policy is of another training, or of this one and newer."""
+    return offered.run_id != run_id or offered.version > version

@@ -22,8 +22,9 @@ from actors.simulator import Simulator, make_simulator
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from learner.checkpoint import NETWORK_PREFIX, Checkpoint, CheckpointMetadata, CodeRanges
-from learner.network.numpy_network import NumpyNetwork, Parameters, make_acting_network
-from learner.network.subnets import parameter_shapes
+from learner.network.acting import make_acting_network
+from learner.network.numpy_network import NumpyNetwork
+from learner.network.subnets import Parameters, parameter_shapes
 from learner.network.vision_input import vision_input
 from learner.network_policy import NetworkPolicy
 from proto.body import ACTION_VALUES, FOCUS

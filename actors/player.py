@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.attention import attention_of, clip_action, crop_of_focus, targets_of_action
+from actors.attention import clip_action, crop_of_focus, targets_of_action, with_attention_of
 from actors.policies.contract import Policy
 from actors.simulator import Simulator
 from actors.tasks.contract import Task
@@ -105,4 +105,4 @@ def play(
 
 def _told(task: Task, action: Array) -> Array:
     """The action as far as the task leaves it to the policy."""
-    return action if task.attention == "active" else attention_of(task.start, action)
+    return action if task.attention == "active" else with_attention_of(task.start, action)

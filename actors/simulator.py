@@ -1,11 +1,11 @@
-"""The neutral simulator interface: a scene and joint targets in, observations and truth out.
+"""The simulator interface: a scene and joint targets in, observations and true poses out.
 
 World frame (right-handed): x to the robot's right, y forward, z up. The origin lies on the table
 top, straight below the origin of the robot's root link. The paper's task frame is left-handed:
 x_world = -X_task, y_world = Y_task, z_world = Z_task, and a yaw changes its sign.
 
-Nothing outside a backend's folder imports a simulator, and nothing is welded, attached or
-teleported while a scene runs: what is lifted is lifted by friction.
+Only a backend's own folder imports its simulator. During an episode nothing is welded, attached or
+teleported: what is lifted is lifted by friction.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ EYE_HEIGHT: Final = 240
 DARK_SCREEN: Final = 20
 """Grey level of a screen that shows nothing."""
 ROBOT: Final = "robot"
-"""Name under which the robot stands in contact reports."""
+"""Name of the robot in contact reports."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ class Box:
 
 @dataclass(frozen=True)
 class JointTargets:
-    """What the motors are told, in degrees.
+    """Target angles of all motors, in degrees.
 
     Attributes:
         neck_deg: (2,) pitch, yaw.
@@ -133,11 +133,11 @@ class Screen:
 
 @dataclass(frozen=True)
 class Scene:
-    """All that one episode starts from.
+    """The initial state of an episode.
 
     Attributes:
         boxes: table, obstacle, objects.
-        start: posture of the robot; it starts at rest there.
+        start: posture in which the robot starts, at rest.
         table_drop_m: how far the table top lies below the robot's root link (m).
         screen: a screen, if there is one.
     """
@@ -161,7 +161,7 @@ class Observation:
     """What the robot senses at one instant.
 
     Attributes:
-        image: (48, 64) uint8 grey picture of the crop asked for (V_I before normalization).
+        image: (48, 64) uint8 grey picture of the requested crop (V_I before normalization).
         joints_deg: (18,) measured angles: neck (2), arm (7), hand motors (9), in degrees.
     """
 
@@ -171,7 +171,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class StepReport:
-    """What happened during one control step, looked at in every physics step.
+    """What happened during one control step, collected from all of its physics steps.
 
     Attributes:
         touches: (watched box, toucher) pairs; toucher is ROBOT or the name of a moving box.
@@ -181,7 +181,7 @@ class StepReport:
 
 
 OTHER_SYSTEM: Final = "other"
-"""In `Diagnosis.packages`, any system that is not named there."""
+"""Key in `Diagnosis.packages` for all systems that have no key of their own."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +190,7 @@ class Diagnosis:
 
     Attributes:
         works: whether it can.
-        found: what was found, in one line: what renders, or what is wrong.
+        found: one line that names what renders, or says what is wrong.
         cure: what the user can do about it, in a few lines; empty if it works.
         packages: arguments of `apt-get install` that provide the graphics driver, by system, such
             as "debian-12" or "ubuntu-24.04" (ID and VERSION_ID of /etc/os-release), and for
@@ -218,8 +218,8 @@ class Simulator(Protocol):
     image is black.
 
     Attributes:
-        name: what it is called in the config and in recordings; `make_simulator` sets it.
-        control_period_s: how long one control step lasts (s).
+        name: the backend's name in the config and in recordings; `make_simulator` sets it.
+        control_period_s: duration of one control step.
     """
 
     name: str
@@ -227,7 +227,7 @@ class Simulator(Protocol):
 
     @abstractmethod
     def __init__(self, config: SimulatorConfig) -> None:
-        """Make it.
+        """Make the simulator.
 
         Raises:
             UserError: it cannot run on this machine; the message says what to do.
@@ -236,11 +236,11 @@ class Simulator(Protocol):
     @staticmethod
     @abstractmethod
     def diagnose() -> Diagnosis:
-        """Try whether it can render on this machine; must return even where a driver crashes."""
+        """Try to render on this machine; returns even if a graphics driver crashes."""
 
     @abstractmethod
     def reset(self, scene: Scene) -> None:
-        """Replace whatever was there with `scene`; the same scene gives the same episode."""
+        """Replace the previous scene by `scene`; the same scene gives the same episode."""
 
     @abstractmethod
     def step(self, targets: JointTargets) -> StepReport:
@@ -289,7 +289,7 @@ BACKENDS: Final[Mapping[str, str]] = {"sapien": "actors.backends.sapien.simulato
 
 
 def load_backend(name: str) -> type[Simulator]:
-    """The class of the backend that a name stands for: one of BACKENDS or `package.module:Class`.
+    """The class of the backend with a name: one of BACKENDS, or `package.module:Class`.
 
     Raises:
         UserError: there is no such backend, or it lacks methods of `Simulator`.
@@ -298,7 +298,7 @@ def load_backend(name: str) -> type[Simulator]:
 
 
 def make_simulator(config: SimulatorConfig) -> Simulator:
-    """Make the backend that `config.backend` names; that is its `name`, too.
+    """Make the backend that `config.backend` names, and give it that name.
 
     Raises:
         UserError: there is no such backend, or it cannot run on this machine.

@@ -1,4 +1,4 @@
-"""A whole run on this machine: start everything, show it, stop it, say how it went."""
+"""A whole run on this machine: start all processes, show their state, stop them, report."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -21,6 +21,7 @@ from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
+from services.arguments.common import integer
 from services.board import Board, RunView
 from services.machine.ports import port_trouble
 from services.terminal.display import display
@@ -32,11 +33,11 @@ VMDNN: Final = str(Path(sys.executable).with_name("vmdnn"))
 HUB_WITHIN_S: Final = 30.0
 TOO_MANY_CRASHES: Final = 5
 TOO_SHORT_S: Final = 60.0
-"""A process that crashes so many times within so short a time is not worth another start."""
+"""A process that crashes TOO_MANY_CRASHES times within this time is not started again."""
 
 
 class ProcessFailedError(Exception):
-    """A process ended for good, or crashes again and again."""
+    """A process cannot go on, or crashes again and again; the message has the end of its log."""
 
     def __init__(self, process: ProcessState, what: str) -> None:
         lines = process.log.read_text(errors="replace").splitlines() if process.log.exists() else []
@@ -46,7 +47,7 @@ class ProcessFailedError(Exception):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run until done or told to stop; the result is the exit status."""
+    """Play a run until it is done or should stop; gives the exit status."""
     arguments = _parser().parse_args(argv)
     try:
         overrides = list(arguments.overrides)
@@ -72,7 +73,7 @@ def default_actors() -> int:
 
 
 def run(config: Config, actors: int, console: Console) -> None:
-    """Play a run with so many actors until it is done or this process is told to stop.
+    """Play a run with so many actors until it is done or this process should stop.
 
     Raises:
         UserError: the run's folder cannot be used.
@@ -83,8 +84,7 @@ def run(config: Config, actors: int, console: Console) -> None:
     lifecycle.stop_on_signals()
     known = (config.run_folder / "config.yaml").exists()
     logs = config.run_folder / "logs"
-    # The run's own config.yaml is the learner's to write, once it has seen that the run can go on
-    # with this one.
+    # The learner writes the run's own config.yaml, once it knows that the run can go on with it.
     file = logs / "config.yaml"
     config.save(file)
     console.print(
@@ -104,7 +104,7 @@ def run(config: Config, actors: int, console: Console) -> None:
 
 
 def programs(config: Config, file: Path, actors: int) -> list[Program]:
-    """What a run is made of, in the order of starting."""
+    """The programs of a run, in the order in which they are started."""
 
     def vmdnn(role: Role) -> tuple[str, ...]:
         return (VMDNN, role.value, "--config", str(file))
@@ -126,7 +126,7 @@ def programs(config: Config, file: Path, actors: int) -> list[Program]:
 
 
 def is_done(view: RunView) -> bool:
-    """Whether learner and evaluator say that they have reached what the config's `done` asks."""
+    """Whether learner and evaluator have reached what the configuration's `done` asks."""
     learners = view.living(LearnerMetrics)
     evaluators = view.living(EvaluatorMetrics)
     if not learners or not evaluators:
@@ -135,20 +135,20 @@ def is_done(view: RunView) -> bool:
 
 
 class Crashes:
-    """Counts how often processes had to be started again."""
+    """Counts how often each process crashed and was started again."""
 
     def __init__(self) -> None:
-        """Start with none."""
+        """Start without any crash."""
         self._started_s: dict[str, int] = {}
         self._crashes_s: defaultdict[str, deque[int]] = defaultdict(
             lambda: deque(maxlen=TOO_MANY_CRASHES)
         )
 
     def look(self, processes: Iterable[ProcessState]) -> list[ProcessState]:
-        """Which processes have come back since the last look.
+        """The processes that were started again since the last look.
 
         Raises:
-            ProcessFailedError: one of them cannot be helped by starting it again.
+            ProcessFailedError: starting a process again does not help.
         """
         back = []
         for process in processes:
@@ -166,7 +166,7 @@ class Crashes:
 
 
 def summary(view: RunView, config: Config, wall_s: float) -> str:
-    """How a run went, in a few lines."""
+    """The result of a run, in a few lines."""
     minutes, seconds = divmod(round(wall_s), 60)
     lines = [
         f"run {config.run.name}: {view.policy_version} policy versions"
@@ -181,7 +181,7 @@ def summary(view: RunView, config: Config, wall_s: float) -> str:
 def _follow(
     board: Board, supervisor: Supervisor, lifecycle: Lifecycle, console: Console
 ) -> RunView:
-    """Show what happens until the run is done or should stop; the last view."""
+    """Show the state of the run until it is done or should stop; gives the last state."""
     crashes = Crashes()
     with display(console) as show:
         while True:
@@ -207,7 +207,7 @@ def _connect(config: Config, supervisor: Supervisor, lifecycle: Lifecycle) -> Bu
 
 
 def _newest_counted(scores: Sequence[PolicyScore], config: Config) -> PolicyScore | None:
-    """The newest policy with all its trials counted; where there is none, the newest with any."""
+    """The newest policy of which all trials are counted; if none is, of which any is."""
     whole = [score for score in scores if score.trials >= config.evaluator.trials_per_policy]
     return max(whole or scores, key=lambda score: score.version, default=None)
 
@@ -236,20 +236,10 @@ def _span(times_s: Sequence[int]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="run_local", add_help=False)  # run_local.sh has the help
     parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG)
-    parser.add_argument("--actors", type=_at_least(0))
+    parser.add_argument("--actors", type=integer(0))
     parser.add_argument("--backend")
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     return parser
-
-
-def _at_least(least: int) -> Callable[[str], int]:
-    def number(text: str) -> int:
-        value = int(text)
-        if value < least:
-            raise argparse.ArgumentTypeError(f"{text} is less than {least}")
-        return value
-
-    return number
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A run's processes under supervisord: what crashes comes back, and nothing outlives the run."""
+"""The processes of a run under supervisord: crashed ones come back, none outlives the run."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from proto.storage import written_whole
 
 START_WITHIN_S: Final = 20.0
 BAD_INPUT: Final = 2
-"""Exit status of a process that was given bad input: starting it again would not help."""
+"""Exit status for bad input: the process is not started again."""
 
-# Each process asks the kernel for a SIGTERM when its parent dies, however that dies: a script that
-# is killed outright takes everything with it.
+# The kernel sends SIGTERM to a process whose parent dies, whatever the reason: when the script is
+# killed, all its processes end.
 _DIES_WITH_PARENT: Final = ("setpriv", "--pdeathsig", "TERM", "--")
 
 
@@ -36,9 +36,9 @@ class Program:
     Attributes:
         name: name of the process; where there are several, `name-1`, `name-2` and so on.
         command: what it runs.
-        threads: how many threads each process may compute with; threads that fight for cores cost
-            far more than they gain.
-        processes: how many of it.
+        threads: number of threads that each process may compute with; more threads than cores
+            make all of them much slower.
+        processes: number of processes.
         stop_within_s: time from SIGTERM to SIGKILL.
     """
 
@@ -51,15 +51,15 @@ class Program:
 
 @dataclass(frozen=True)
 class ProcessState:
-    """How one process is doing.
+    """The state of one process.
 
     Attributes:
-        name: see Program.
-        state: supervisord's word for it, such as RUNNING, EXITED or FATAL.
-        pid: its process id, 0 where it does not run.
+        name: name of the process, see Program.
+        state: the state in supervisord's terms, such as RUNNING, EXITED or FATAL.
+        pid: process id, 0 if it does not run.
         started_s: when it was started last (Unix time), 0 if never.
-        exit_status: of the last process of that name that ended.
-        log: what it printed.
+        exit_status: exit status of the last process of this name that ended.
+        log: file with its output.
     """
 
     name: str
@@ -71,21 +71,22 @@ class ProcessState:
 
     @property
     def gave_up(self) -> bool:
-        """Whether it ended and is not started again because that would not help."""
+        """Whether it has ended and is not started again."""
         return self.state == "FATAL" or (self.state == "EXITED" and self.exit_status == BAD_INPUT)
 
 
 class Supervisor:
-    """Starts programs when told to, and stops all in the reverse of their order on leaving.
+    """Starts programs on request; when its context ends, it stops all in reverse order.
 
-    It must be entered on the main thread: the kernel ties the processes' lives to that thread.
+    The context must be entered on the main thread: the kernel ends the processes when the thread
+    that started them ends.
 
     Attributes:
-        programs: what it starts and stops, in this order.
+        programs: the programs, in the order of starting.
     """
 
     def __init__(self, programs: Sequence[Program], folder: Path) -> None:
-        """Make a supervisor that keeps its config and the logs of all in `folder`."""
+        """Make a supervisor; its configuration and all logs are kept in `folder`."""
         self.programs = programs
         self._folder = folder.resolve()
         self._process: subprocess.Popen[bytes] | None = None
@@ -121,11 +122,11 @@ class Supervisor:
         self.stop()
 
     def start(self, program: str) -> None:
-        """Start the processes of a program; from now on they come back when they crash."""
+        """Start the processes of a program; from now on they are started again when they crash."""
         self._ask("startProcessGroup", program, False)
 
     def processes(self) -> list[ProcessState]:
-        """How all processes are doing now."""
+        """The state of all processes."""
         return [
             ProcessState(
                 name=info["name"],
@@ -139,7 +140,7 @@ class Supervisor:
         ]
 
     def stop(self) -> None:
-        """Stop everything and wait until it is gone; called again, it does nothing."""
+        """Stop all processes and wait until they have ended; further calls do nothing."""
         if self._process is None:
             return
         self._process.terminate()
@@ -174,10 +175,10 @@ class Supervisor:
 
 
 def supervisord_config(programs: Sequence[Program], folder: Path, socket: Path) -> str:
-    """The text of supervisord's config: logs in `folder`, orders taken on `socket`.
+    """The text of supervisord's configuration: logs in `folder`, commands through `socket`.
 
     Raises:
-        UserError: a name or value that supervisord's config cannot hold.
+        UserError: a name or value contains what supervisord's configuration cannot express.
     """
     head = f"""\
 [supervisord]
@@ -224,7 +225,7 @@ stdout_logfile_backups=1
 
 def _plain(value: str | Path) -> str:
     text = str(value)
-    # supervisord takes these for comments and for names to fill in, and nothing can quote them.
+    # supervisord reads these as comments and placeholders, and has no way to quote them.
     if odd := next((mark for mark in (" ;", " #", "%", "\n") if mark in text), None):
-        raise UserError(f"{text!r} holds {odd!r}, which supervisord cannot take: rename it")
+        raise UserError(f"{text!r} holds {odd!r}, which supervisord cannot read: rename it")
     return text

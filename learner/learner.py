@@ -1,4 +1,4 @@
-"""The learner on the bus: asks for sequences, keeps them, trains, publishes policies."""
+"""The learner on the bus: asks for sequences, stores them, trains, publishes policies."""
 
 from __future__ import annotations
 
@@ -18,17 +18,20 @@ from learner.training.training_run import (
     pretraining_is_over,
     write_policy,
 )
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.corrections import Round, Situations
 from learner.tutoring.curriculum import Curriculum
+from learner.tutoring.failures import TRIES, Shown
 from learner.tutoring.store import TutoringStore
 from proto.bus import Bus, Inbox
 from proto.config import Config
-from proto.episode import Episode
+from proto.episode import Kind
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import alone_in_run, membership
 from proto.messages import (
     Correction,
+    EpisodeFailed,
     PolicyVersion,
     Receipt,
     Sequence,
@@ -43,32 +46,33 @@ from proto.storage import written_whole
 LOG = logging.getLogger(__name__)
 
 WAITING: Final = 64
-"""Sequences that may wait to be kept; more are dropped, and sent again by their actors."""
+"""Messages that may wait to be handled; more are dropped, and sent again by their actors."""
 IDLE_S: Final = 0.2
+"""How often to look whether it should stop or may train, while it waits for sequences."""
 _TRAINING: Final = (Stage.PRETRAINING, Stage.COUPLED)
+_LEARNED_FROM: Final = (Kind.TUTORING, Kind.CORRECTION)
 
 
 @dataclass(frozen=True)
 class _Material:
-    """What a stage learns from.
+    """What a stage of training learns from.
 
     Attributes:
+        task: name of the task.
         store: its sequences.
-        start_with: so many of them are enough to start.
+        start_sequences: number of sequences to start with, or fewer where no more can come.
     """
 
+    task: str
     store: TutoringStore
-    start_with: int
-
-    @property
-    def enough(self) -> bool:
-        return len(self.store) >= self.start_with
+    start_sequences: int
 
 
 class Learner:
-    """Restores first, publishes second: what it published before a restart it still knows.
+    """Trains, while it receives sequences and hands out cases.
 
-    Sequences come in, and cases are handed out, while it trains.
+    A training is on disk before its policy is published, so a restarted learner never publishes
+    another policy under a version that was published before.
     """
 
     def __init__(
@@ -78,13 +82,13 @@ class Learner:
 
         Args:
             config: the configuration of the run.
-            bus: connection to the others.
-            lifecycle: when to pause and to stop.
-            tasks: the situations of each task, by name.
+            bus: connection to the other processes.
+            lifecycle: says when to pause and to stop.
+            tasks: the situations of each task, by the name of the task.
 
         Raises:
             UserError: the folder holds a training that cannot go on, or the configuration asks for
-                a case that there is not.
+                a case that the task does not have.
         """
         self._config = config
         self._bus = bus
@@ -96,23 +100,23 @@ class Learner:
         self._stores = _stores(config)
         self._materials = self._make_materials()
         self._trainer = open_training(
-            config,
+            VMDNNRecipe(config, tasks[config.pretraining_task or config.task.name].questions),
             self._folder,
             self._materials[Stage.COUPLED].store,
             self._materials[Stage.PRETRAINING].store,
-            questions=tasks[config.pretraining_task or config.task.name].questions,
             rounds=config.learner.corrections.rounds,
         )
         self._training = threading.Lock()  # held while the trainer changes or is written to disk
         self._run_id = _run_id(self._folder)
         self._round = self._make_round()
+        self._given_up = 0
         for store in self._stores.values():
-            for episode in filter(None, map(store.load, store.ids)):
-                self._note(episode)
+            for summary in store.summaries():
+                self._note(summary)
         self._pace = Pace()
 
     def run(self) -> None:
-        """Learn until it should stop, then save.
+        """Learn until it should stop, then save the training.
 
         Raises:
             UserError: the run has a learner already, the training diverged, or the disk is full.
@@ -120,17 +124,21 @@ class Learner:
         alone_in_run(self._bus, self._lifecycle)
         self._config.save(self._folder / "config.yaml")
         self._publish()
-        inbox = self._open_doors()
+        keys = self._bus.keys
+        sequences = self._bus.inbox(keys.sequence(), Sequence, capacity=WAITING)
+        failures = self._bus.inbox(keys.failure(), EpisodeFailed, capacity=WAITING)
+        self._answer_and_listen()
         with membership(self._bus, self, self._lifecycle):
             while not self._lifecycle.stopping:
                 may_train = self._may_train
-                self._receive(inbox, wait_s=0.0 if may_train else IDLE_S)
+                self._receive(sequences, wait_s=0.0 if may_train else IDLE_S)
+                self._receive_failures(failures)
                 if may_train:
                     self._train()
         LOG.info(self.checkpoint())
 
     def metrics(self) -> LearnerMetrics:
-        """What it tells about itself."""
+        """Metrics at this moment."""
         done, awaited = self._config.done, self._round
         return LearnerMetrics(
             id=self._bus.id,
@@ -144,6 +152,7 @@ class Learner:
             round=self._trainer.round,
             corrections=awaited.kept if awaited else 0,
             corrections_total=awaited.most if awaited else 0,
+            given_up=self._given_up,
             epochs_per_s=self._pace.per_second(),
             policy_version=self._trainer.version,
             paused=self._lifecycle.paused,
@@ -151,7 +160,7 @@ class Learner:
         )
 
     def checkpoint(self) -> str:
-        """Save the training, after the epoch that is going on."""
+        """Write the training to disk, after the epoch that is going on."""
         path = training_file(self._folder)
         with self._training:
             self._trainer.save(path)
@@ -164,7 +173,7 @@ class Learner:
     @property
     def _stage(self) -> Stage:
         awaited, material = self._round, self._materials.get(self._trainer.next_stage)
-        waiting = material is not None and not material.enough
+        waiting = material is not None and not self._is_enough(material)
         if awaited is not None:
             waiting = not awaited.complete
         return Stage.WAITING if waiting else self._trainer.stage
@@ -175,22 +184,26 @@ class Learner:
 
     def _make_materials(self) -> Mapping[Stage, _Material]:
         """What coupled training and pre-training learn from."""
-        learner, sizes = self._config.learner, self._curriculum.sizes
+        learner = self._config.learner
         task, first = self._config.task.name, self._config.pretraining_task
-        coupled = _Material(self._stores[task], min(learner.start_sequences, sizes[task]))
+        coupled = _Material(task, self._stores[task], learner.start_sequences)
         pretraining = coupled
         if first is not None:
-            enough = min(learner.pretraining.start_sequences, sizes[first])
-            pretraining = _Material(self._stores[first], enough)
+            start_sequences = learner.pretraining.start_sequences
+            pretraining = _Material(first, self._stores[first], start_sequences)
         return {Stage.COUPLED: coupled, Stage.PRETRAINING: pretraining}
 
-    def _open_doors(self) -> Inbox[Sequence]:
-        """From now on sequences are received and cases handed out."""
+    def _is_enough(self, material: _Material) -> bool:
+        """Whether a stage has the sequences to start with."""
+        possible = self._curriculum.size(material.task)
+        return len(material.store) >= min(material.start_sequences, possible)
+
+    def _answer_and_listen(self) -> None:
+        """Start to hand out cases and corrections."""
         keys = self._bus.keys
         self._bus.answer(keys.request_tutoring, TutoringRequest, self._hand_out)
         self._bus.subscribe(keys.verdict, self._on_verdict, Verdict)
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
-        return self._bus.inbox(keys.sequence(), Sequence, capacity=WAITING)
 
     def _hand_out(self, request: TutoringRequest) -> TutoringCase | Correction | None:
         if self._lifecycle.paused:
@@ -217,31 +230,57 @@ class Learner:
             if self._wants(episode):
                 self._stores[episode.task].add(episode)
                 self._note(episode)
-                LOG.info("kept a %s sequence, %d in all", episode.kind, self._sequences)
-            # One that is not wanted, such as the second of a case, need not be sent again either.
-            self._bus.deliver(self._bus.keys.receipt(episode.actor), Receipt(episode.id))
+                LOG.info("stored a %s sequence, %d in all", episode.kind, self._sequences)
+            # A second demonstration of a case is not stored, but gets its receipt as well.
+            receipt = Receipt(episode.id, self._refusal(episode))
+            self._bus.deliver(self._bus.keys.receipt(episode.actor), receipt)
             wait_s = 0.0
 
-    def _wants(self, episode: Episode) -> bool:
-        """Whether a case or the round of corrections lacks this episode."""
-        awaited = self._round
-        return self._curriculum.wants(episode) or (awaited is not None and awaited.wants(episode))
+    def _receive_failures(self, inbox: Inbox[EpisodeFailed]) -> None:
+        while (report := inbox.take()) is not None:
+            if report.kind not in _LEARNED_FROM:  # the evaluator answers it
+                continue
+            awaited = self._round
+            if self._curriculum.fail(report) or (awaited is not None and awaited.fail(report)):
+                self._given_up += 1
+                LOG.warning(
+                    "the %s of %s with the seed %d is given up, its simulation failed %d times: %s",
+                    *(report.kind, report.task, report.seed, TRIES, report.problem),
+                )
+            self._bus.deliver(self._bus.keys.receipt(report.actor), Receipt(report.id))
 
-    def _note(self, episode: Episode) -> None:
-        """This episode is kept: it is not wanted any more."""
-        self._curriculum.shown([episode])
+    def _refusal(self, shown: Shown) -> str:
+        """Why this learner will never store a sequence; empty if it might."""
+        if shown.task not in self._stores:
+            return f"this run learns {' and '.join(self._stores)}, not {shown.task}"
+        if shown.kind is Kind.TUTORING:
+            return self._curriculum.refusal(shown)
+        if shown.kind is not Kind.CORRECTION:
+            return f"nothing is learned from an episode of the kind {shown.kind}"
+        if shown.training != self._run_id:
+            return f"it corrects a policy of another training than {self._run_id}"
+        return ""
+
+    def _wants(self, shown: Shown) -> bool:
+        """Whether the curriculum or the round of corrections lacks this sequence."""
+        awaited = self._round
+        return self._curriculum.wants(shown) or (awaited is not None and awaited.wants(shown))
+
+    def _note(self, shown: Shown) -> None:
+        """Note that this sequence is stored, so that it is not asked for any more."""
+        self._curriculum.keep(shown)
         if self._round is not None:
-            self._round.shown(episode)
+            self._round.keep(shown)
 
     def _make_round(self) -> Round | None:
-        """The round of corrections that the next epoch has to wait for, if it is a lap's first."""
+        """The round of corrections that the next epoch has to wait for; None if there is none."""
         if not self._trainer.round_begins:
             return None
         newest = self._run_id, self._trainer.version
         return Round(self._config, self._trainer.round, newest, self._situations)
 
     def _end_round(self) -> None:
-        """All corrections of the round are there; what else comes in is for none."""
+        """End the round of corrections. Corrections that arrive later are not stored."""
         if self._round is not None:
             LOG.info(
                 "round %d is over: %d corrections, %d episodes of practice judged",
@@ -259,10 +298,10 @@ class Learner:
             if over:
                 self._trainer.save(pretraining_file(self._folder))
         self._pace.add()
-        if policy_is_due(self._trainer, self._config.learner):
+        if policy_is_due(self._trainer):
             with self._training:
                 write_policy(self._trainer, self._folder)
-            # the training on disk knows of a version before anyone else does
+            # the training is on disk before its policy is published
             LOG.info(self.checkpoint())
             self._round = self._make_round()
             self._publish()
@@ -270,7 +309,7 @@ class Learner:
             LOG.info(self.checkpoint())
 
     def _publish(self) -> None:
-        """Publish the newest policy there is, if there is one."""
+        """Publish the newest policy version, if there is any."""
         version = self._trainer.version
         if version == 0:
             return
@@ -291,7 +330,7 @@ class Learner:
 
 
 def _stores(config: Config) -> Mapping[str, TutoringStore]:
-    """Where the sequences of each task are kept."""
+    """The store of each task's sequences, by the name of the task."""
     folders = {config.task.name: "tutoring"}
     if config.pretraining_task is not None:
         folders[config.pretraining_task] = "pretraining"
@@ -299,7 +338,7 @@ def _stores(config: Config) -> Mapping[str, TutoringStore]:
 
 
 def _run_id(folder: Path) -> str:
-    """Id of the training in a folder; a training that starts anew gets a new one."""
+    """Id of the training in a run's folder; a training that starts anew gets a new one."""
     path = training_file(folder).with_name("run_id")
     if training_file(folder).exists() and path.exists():
         return path.read_text()

@@ -15,13 +15,11 @@ from learner.checkpoint import (
     checkpoint_from_bytes,
     load_checkpoint,
 )
-from learner.network.numpy_network import (
-    ActingNetwork,
-    NumpyNetwork,
-    Parameters,
-    make_acting_network,
-)
+from learner.network.acting import ActingNetwork, make_acting_network
+from learner.network.numpy_network import NumpyNetwork
+from learner.network.subnets import Parameters
 from learner.network.vision_input import vision_input
+from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import NetworkConfig
 from proto.episode import Floats, Image
 from proto.errors import UserError
@@ -62,7 +60,6 @@ class NetworkPolicy:
                 f"{origin} is from pre-training and cannot act yet; train further, or take a"
                 " later checkpoint"
             )
-        width, height = metadata.network.image
         parameters = cast("Parameters", checkpoint.part(NETWORK_PREFIX))
         self.name = metadata.run
         self.version = metadata.version
@@ -70,7 +67,6 @@ class NetworkPolicy:
         self._code = code
         self._network = make_network(metadata.network, parameters)
         self._sizes, self._parameters = metadata.network, parameters
-        self._image_shape = (height, width)
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
@@ -96,10 +92,10 @@ class NetworkPolicy:
 
     def step(self, image: Image) -> NDArray[np.float64]:
         """Next action (11,), within what the robot accepts, for the picture (48, 64) uint8."""
-        if image.shape != self._image_shape:
+        if image.shape != (IMAGE_HEIGHT, IMAGE_WIDTH):
             raise UserError(
-                f"the network looks at {self._image_shape} pictures (height, width), not"
-                f" {image.shape}; network.image and the camera must agree"
+                f"the network looks at {IMAGE_HEIGHT} x {IMAGE_WIDTH} pictures (height x width),"
+                f" not {image.shape}"
             )
         outputs = self._network.step(vision_input(image))
         self.outputs = np.asarray(outputs, np.float32).ravel()

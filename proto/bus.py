@@ -1,12 +1,12 @@
-"""The bus: the one place that knows Zenoh.
+"""The bus: the connection of a process to the others. No other module uses Zenoh.
 
-Two ways to publish. `publish` may lose a message when a reader or a link is slow: for what is
-watched. `deliver` waits for room, but a message that is under way when a connection breaks is gone
-all the same: what must arrive is kept in an `Outbox` until its receipt comes.
+There are two ways to publish. `publish` may lose messages when a reader or a link is slow; it is
+for live data. `deliver` waits for room, but a message in transit is lost when a connection breaks:
+a message that must arrive is kept in an `Outbox` until its receipt comes.
 
-A message that is not what it should be is counted, logged once for each sender, and dropped.
-Callbacks run in Zenoh's threads: they return quickly. Zenoh does not survive a fork: start
-processes with spawn or exec, and close every bus, or the process never ends.
+An invalid message is counted, logged once for each sender, and dropped. Callbacks run in Zenoh's
+threads and must return quickly. Zenoh does not survive a fork: start processes with spawn or exec.
+A process ends only when all its buses are closed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from proto.keys import Keys, Role
 LOG = logging.getLogger(__name__)
 
 CONNECT_WAIT_S: Final = 5.0
-"""How long a starting process waits for the hub."""
+"""How long a process that starts waits for the hub."""
 SHARED_MEMORY_FROM_BYTES: Final = 64 * 1024
 _SENDERS_REMEMBERED: Final = 1000
 _HEARTBEAT_S: Final = 1.0
@@ -44,10 +44,10 @@ Answer = TypeVar("Answer")
 @message("attachment", 1, form="json")
 @dataclass(frozen=True)
 class Attachment:
-    """What goes with every message of ours; messages of others may lack it.
+    """What vmdnn sends along with each message; other senders may leave it out.
 
     Attributes:
-        sender: role and id of who sent it.
+        sender: role and id of the sender, such as `actor/host-1`.
         sha256: digest of the payload.
     """
 
@@ -69,16 +69,16 @@ class Attachment:
         return encode(self).payload
 
     def check(self, payload: bytes) -> None:
-        """Raise MessageError if the payload is not the one that was sent."""
+        """Compare a payload with the digest; raises MessageError if they differ."""
         if hashlib.sha256(payload).hexdigest() != self.sha256:
             raise MessageError("payload", "differs from its digest in the attachment")
 
 
 class Inbox(Generic[M]):
-    """The newest messages of a key that nobody has taken yet; older ones are dropped when full.
+    """Messages of a key that wait to be taken; when it is full, the oldest one is dropped.
 
     Attributes:
-        dropped: how many messages were dropped because nobody took them in time.
+        dropped: number of messages that were dropped because they were not taken in time.
     """
 
     def __init__(self, bus: Bus, classes: tuple[type[M], ...], capacity: int) -> None:
@@ -93,7 +93,7 @@ class Inbox(Generic[M]):
         return len(self._waiting)
 
     def take(self, timeout_s: float = 0.0) -> M | None:
-        """The oldest valid message, waiting for one if need be; None if none came in time."""
+        """The oldest valid message; None if none arrives within timeout_s."""
         while (sample := self._next(timeout_s)) is not None:
             try:
                 return self._bus.decode(sample, *self._classes)
@@ -102,7 +102,7 @@ class Inbox(Generic[M]):
         return None
 
     def put(self, sample: zenoh.Sample) -> None:
-        """Keep a sample until it is taken."""
+        """Add a sample."""
         with self._arrived:
             if len(self._waiting) == self._capacity:
                 self._waiting.popleft()
@@ -118,13 +118,13 @@ class Inbox(Generic[M]):
 
 
 class Bus:
-    """One process's connection to the others.
+    """The connection of a process to the other processes of a run.
 
     Attributes:
         keys: keys of the run.
-        role: what this process is.
-        id: which one it is.
-        refused: messages dropped so far because they were not valid.
+        role: role of this process.
+        id: id of this process.
+        refused: number of messages that were dropped because they were invalid.
     """
 
     def __init__(self, session: zenoh.Session, run: str, role: Role, process: str) -> None:
@@ -146,34 +146,40 @@ class Bus:
 
     @property
     def peers(self) -> int:
-        """Number of sessions that are connected to this one."""
+        """Number of Zenoh sessions that are connected to this one."""
         return len(self._session.info.transports())
 
     def close(self) -> None:
-        """Leave; may be called again."""
+        """Close the connection; further calls do nothing."""
         if not self._session.is_closed():
             self._session.close()  # type: ignore[no-untyped-call]
 
     def watched(self, key: str) -> bool:
-        """Whether anyone subscribes to a key, as far as this process knows by now."""
+        """Whether anyone subscribes to a key, as far as this process knows at this moment."""
         if key not in self._watched:
             self._watched[key] = self._session.declare_publisher(key)
         return bool(self._watched[key].matching_status.matching)  # type: ignore[attr-defined]
 
     def publish(self, key: str, message: Any, *, check: bool = True) -> None:
-        """Publish a message that may be lost, also because it is wrong and was not checked."""
+        """Publish a message that may be lost.
+
+        Args:
+            key: where.
+            message: the message.
+            check: check its fields before it is sent; without it, receivers drop an invalid one.
+        """
         self._put(key, encode(message, check=check), zenoh.CongestionControl.DROP)
 
     def deliver(self, key: str, message: Any) -> None:
-        """Publish a message, waiting while the link is full; see the top of this module."""
+        """Publish a message; waits while the link is full."""
         self.deliver_wire(key, encode(message))
 
     def deliver_wire(self, key: str, wire: Wire) -> None:
-        """The same with a message that is encoded already."""
+        """Publish an encoded message; waits while the link is full."""
         self._put(key, wire, zenoh.CongestionControl.BLOCK)
 
     def publish_newest(self, key: str, message: Any) -> None:
-        """Publish a message that late joiners get as well, as long as this process lives."""
+        """Publish a message that later subscribers get as well, as long as this process lives."""
         if key not in self._newest:
             self._newest[key] = zenoh.ext.declare_advanced_publisher(
                 self._session,
@@ -196,13 +202,13 @@ class Bus:
         )
 
     def subscribe(self, key: str, callback: Callable[[M], None], *classes: type[M]) -> None:
-        """Call back with every message of `classes` under a key."""
+        """Call `callback` with every message of `classes` under a key."""
         self._declared.append(
             self._session.declare_subscriber(key, self._receiver(callback, classes))
         )
 
     def subscribe_newest(self, key: str, callback: Callable[[M], None], *classes: type[M]) -> None:
-        """The same for `publish_newest`: what was published before is received first."""
+        """Subscribe to `publish_newest`: the newest earlier message is received first."""
         self._declared.append(
             zenoh.ext.declare_advanced_subscriber(
                 self._session,
@@ -214,7 +220,7 @@ class Bus:
         )
 
     def inbox(self, key: str, *classes: type[M], capacity: int) -> Inbox[M]:
-        """Collect the messages of `classes` under a key until they are taken."""
+        """Collect messages of `classes` under a key; at most `capacity` wait to be taken."""
         inbox = Inbox(self, classes, capacity)
         self._declared.append(self._session.declare_subscriber(key, inbox.put))
         return inbox
@@ -222,9 +228,9 @@ class Bus:
     def ask(
         self, key: str, question: Any, *answers: type[Answer], timeout_s: float = 2.0
     ) -> list[Answer]:
-        """Ask everyone who answers under a key with a message of one of the classes `answers`.
+        """Ask all processes that answer under a key; gives their valid answers.
 
-        Nobody, or nobody in time, is an empty list.
+        The list is empty if nobody answers within timeout_s.
         """
         wire = encode(question)
         replies = self._session.get(
@@ -246,7 +252,7 @@ class Bus:
         return given
 
     def answer(self, key: str, question: type[M], callback: Callable[[M], object | None]) -> None:
-        """Answer questions under a key with a message, or with None: nothing to say."""
+        """Answer questions under a key with what `callback` returns; None gives no answer."""
 
         def on_query(query: zenoh.Query) -> None:
             with query:  # a query that is not dropped hangs whoever asks
@@ -268,21 +274,21 @@ class Bus:
         self._declared.append(self._session.declare_queryable(key, on_query))
 
     def announce(self) -> None:
-        """Show that this process lives, until it closes the bus or dies."""
+        """Declare the liveliness token: this process is present until it closes the bus or dies."""
         token = self._session.liveliness().declare_token(self.keys.alive(self.role, self.id))
         self._declared.append(token)
 
     def present(self, role: Role) -> set[str]:
-        """Ids of the processes of a role that live."""
+        """Ids of the living processes of a role."""
         replies = self._session.liveliness().get(self.keys.alive(role), timeout=2.0)
         return {
             str(reply.ok.key_expr).rpartition("/")[2] for reply in replies if reply.ok is not None
         }
 
     def watch_presence(self, role: Role, callback: Callable[[str, bool], None]) -> None:
-        """Call back with an id and True for each process of a role that lives, False when it dies.
+        """Call back with id and True for each living process of a role, with False when it dies.
 
-        When the hub dies, so does everyone, seen from here.
+        When the hub dies, all processes seem to die.
         """
 
         def on_change(sample: zenoh.Sample) -> None:
@@ -299,10 +305,10 @@ class Bus:
         )
 
     def decode(self, received: zenoh.Sample | zenoh.Query, *classes: type[M]) -> M:
-        """The message in what was received.
+        """Decode what was received.
 
         Raises:
-            MessageError: it is not valid; it has been counted and logged.
+            MessageError: it is invalid; it has been counted and logged.
         """
         sender = str(received.key_expr)
         payload = b"" if received.payload is None else received.payload.to_bytes()
@@ -346,11 +352,11 @@ class Bus:
         if sender in self._complained_about or len(self._complained_about) >= _SENDERS_REMEMBERED:
             return
         self._complained_about.add(sender)
-        LOG.warning("refused a message of %s: %s (said once for each sender)", sender, error)
+        LOG.warning("refused a message of %s: %s (logged once for each sender)", sender, error)
 
 
 def open_bus(config: HubConfig, run: str, role: Role, process: str) -> Bus:
-    """Connect to the hub; once connected, a lost connection comes back by itself.
+    """Connect to the hub. A connection that is lost later is made again automatically.
 
     Raises:
         UserError: no hub answers within CONNECT_WAIT_S.
@@ -408,7 +414,7 @@ def _open(settings: dict[str, Any]) -> zenoh.Session:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """The first cause in a Zenoh error, without the places in Zenoh's source."""
+    """The first cause of a Zenoh error, without locations in Zenoh's source code."""
     text = re.sub(r" at \S+\.rs:\d+\.?", "", str(error))
     causes = re.findall(r"\[\S+: ([^\[\]]+)\]", text)
     return str(causes[-1] if causes else text)

@@ -78,7 +78,7 @@ class _Section(BaseModel):
 
 
 class RunConfig(_Section):
-    """The run: a folder with its config, checkpoints, tutoring, rollouts, evaluation and logs."""
+    """Name and folder of the run, and the seed of everything random in its training."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = "experiment1"
     folder: Annotated[Path, AfterValidator(_expand_home)] = Path("runs")
@@ -99,7 +99,7 @@ TaskName = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 Attention = Literal["active", "fixed"]
-"""Whether the robot turns its head and focuses, or keeps both as they are at the start."""
+"""Whether the robot moves its head and its focus, or keeps both as they are at the start."""
 
 
 class TaskConfig(_Section):
@@ -124,7 +124,7 @@ class TaskConfig(_Section):
 
 
 class SimulatorConfig(_Section):
-    """Which simulator plays the scenes, and how finely."""
+    """Which simulator plays the scenes, and with which time steps."""
 
     backend: str = "sapien"
     control_period_s: Positive = 0.1
@@ -147,8 +147,8 @@ class ActorConfig(_Section):
     """What actors do besides tutoring and trials.
 
     Attributes:
-        practice: play situations of one's own when nothing is asked for.
-        live: publish each step while anyone watches.
+        practice: play random situations when nothing is asked for.
+        live: publish each control step while anyone subscribes to it.
     """
 
     practice: Switch = True
@@ -159,10 +159,11 @@ class TutorConfig(_Section):
     """How the tutor executes its plan when a case is tutored again, and how it guides a policy.
 
     Attributes:
-        repeats: executions of each case, the first of them clean.
+        repeats: executions of each case; the first has no noise.
         noise_deg: amplitude of the execution noise.
         noise_correlation_steps: over how many control steps it is correlated.
-        guidance_deg: in a correction, how far neck and arm may be told to be from the clean plan.
+        guidance_deg: in a correction, how far the actions of neck and arm may be from the clean
+            plan.
     """
 
     repeats: Repeats = 4
@@ -190,7 +191,6 @@ class MapsConfig(_Section):
 class NetworkConfig(_Section):
     """VMDNN (paper, section 4.1)."""
 
-    image: tuple[Count, Count] = (64, 48)
     mstnn_fast: MapsConfig = MapsConfig(maps=3, kernel=(22, 14), stride=2, tau=2)
     mstnn_slow: MapsConfig = MapsConfig(maps=6, kernel=(8, 6), stride=2, tau=30)
     pfc: SubnetConfig = SubnetConfig(units=20, tau=150)
@@ -244,15 +244,15 @@ class CorrectionsConfig(_Section):
     """Tutoring that goes on when coupled training is over, on the bus only.
 
     In each round the tutor guides the newest policy in some situations (see
-    `TutorConfig.guidance_deg`). Then training goes on with all sequences: so many epochs with a
-    warm-up and a schedule of their own, and a policy at their end.
+    `TutorConfig.guidance_deg`). Then training goes on with all sequences for some epochs, which
+    have a warm-up and a schedule of their own and end with a policy.
 
     Attributes:
         rounds: number of rounds.
-        choose: in which situations: those in which the newest policy was not precise in practice
+        choose: the situations: those in which the newest policy was not precise in practice
             (`failures`), random ones, or the tutored cases in their order.
-        sequences: corrections of a round; fewer if there are not as many tutored cases.
-        tries: among failures, no more are looked for once so many episodes of practice were judged.
+        sequences: corrections of a round; fewer if there are fewer tutored cases.
+        tries: episodes of practice that are judged in a round to find failures.
         epochs: epochs after each round.
     """
 
@@ -298,7 +298,7 @@ class LearnerConfig(_Section):
 
 
 RivalKind = Literal["cnn-lstm", "feed-forward"]
-"""Networks of other kinds, which VMDNN is compared with."""
+"""Networks of other kinds that VMDNN is compared with."""
 
 
 class RivalConfig(_Section):
@@ -349,23 +349,24 @@ class EvaluatorConfig(_Section):
     """Trials of unlearned situations, counted for each policy version."""
 
     trials_per_policy: Annotated[int, Field(strict=True, ge=1, le=2**28)] = 52
-    # the last trial's seed is so below all those that may be tutored
+    # so that the seeds of all trials are below those of corrections and practice
     seed: Annotated[int, Field(strict=True, ge=0, le=TRIALS_BELOW - 2**28)] = 1000
     lease_s: Positive = 60.0
 
 
 class RecorderConfig(_Section):
-    """What is kept of the rollouts on disk: all of them, or only those that are trials."""
+    """Which rollouts are recorded: all of them, or only trials."""
 
     practice: Switch = True
 
 
 class DoneConfig(_Section):
-    """When a run started by deploy/run_local.sh is finished; with neither condition, never.
+    """When a run started by deploy/run_local.sh is finished; without conditions it never is.
 
     Attributes:
-        policy_versions: so many policy versions were published.
-        trials: the newest policy version, and it is at least that one, has so many trials counted.
+        policy_versions: number of policy versions to publish.
+        trials: number of trials to count of the newest policy version, which must be at least
+            `policy_versions`.
     """
 
     policy_versions: Count | None = None
@@ -378,7 +379,7 @@ class DoneConfig(_Section):
 
 
 class Config(_Section):
-    """Everything a run depends on."""
+    """The configuration of a run."""
 
     run: RunConfig = RunConfig()
     hub: HubConfig = HubConfig()
@@ -400,7 +401,7 @@ class Config(_Section):
 
     @property
     def pretraining_task(self) -> str | None:
-        """Task of the sequences of pre-training; None where those of coupled training serve."""
+        """Task of the sequences of pre-training; None if it uses those of coupled training."""
         first = self.learner.pretraining
         return None if first.epochs == 0 or first.task == self.task.name else first.task
 
@@ -424,10 +425,7 @@ class Config(_Section):
         return self
 
     def digest(self) -> str:
-        """Twelve hexadecimal digits that tell one effective configuration from another.
-
-        Where the hub and the folder are makes no difference.
-        """
+        """Twelve hexadecimal digits over all values, except the hub's and the run's folder."""
         values = self.model_dump(mode="json", exclude={"hub": True, "run": {"folder"}})
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]

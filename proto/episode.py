@@ -103,6 +103,10 @@ class Outcome:
         return self.measures[measure].value
 
 
+SIMULATION_FAILED: Final = Outcome(False, False, False, "simulation_failed", {})
+"""Outcome of a trial whose simulation gave no valid episode; nothing was measured."""
+
+
 @dataclass(frozen=True)
 class Episode:
     """One episode of T control steps.
@@ -134,6 +138,8 @@ class Episode:
         control_period_s: time from one control step to the next (s).
         states: (T, units) float32 of each subnet by name, its activity, where that was asked for;
             else None.
+        training: id of the training that the policy comes from; empty for the tutor and for a
+            policy from a file.
     """
 
     id: Id
@@ -163,6 +169,7 @@ class Episode:
         States | None,
         Added(Table(Array("float32", (STEPS, Size("units", 1, 65536, own=True))), most=16)),
     ] = field(default=None)
+    training: Annotated[str, Text(64)] = ""
 
     def __post_init__(self) -> None:
         """Raise ValueError if a step is in a phase without a name."""

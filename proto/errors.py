@@ -1,8 +1,8 @@
-"""The one exception that means "the user can mend this"."""
+"""The exception for errors that the user can correct."""
 
 
 class UserError(Exception):
-    """Bad input. The message says what was wrong, which value, and what to do.
+    """Bad input. The message says what is wrong, which value, and what to do.
 
     The command line prints the message without a stack trace and exits with status 2.
     """

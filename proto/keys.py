@@ -1,4 +1,4 @@
-"""The keys of a run: every name under which something crosses a process boundary."""
+"""Zenoh keys of a run: all names under which processes exchange messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Role(StrEnum):
 
 
 ANYONE = "*"
-"""Stands for every id when subscribing."""
+"""Matches every id in a subscription."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +43,12 @@ class Keys:
 
     @property
     def request_tutoring(self) -> str:
-        """Actor asks the learner: `TutoringRequest`.
-
-        It is answered by `TutoringCase`, `Correction` or nothing.
-        """
+        """Actor asks the learner: `TutoringRequest`, answered by `TutoringCase` or `Correction`."""
         return f"vmdnn/{self.run}/request/tutoring"
 
     @property
     def request_trial(self) -> str:
-        """Actor asks the evaluator: `TrialRequest`, answered by `Trial` or nothing."""
+        """Actor asks the evaluator: `TrialRequest`, answered by `Trial`."""
         return f"vmdnn/{self.run}/request/trial"
 
     @property
@@ -67,6 +64,10 @@ class Keys:
         """Actor to evaluator: `Rollout`."""
         return f"vmdnn/{self.run}/rollout/{actor}"
 
+    def failure(self, actor: str = ANYONE) -> str:
+        """Actor to learner and evaluator: `EpisodeFailed`."""
+        return f"vmdnn/{self.run}/failure/{actor}"
+
     def receipt(self, actor: str) -> str:
         """Learner and evaluator to actor: `Receipt`."""
         return f"vmdnn/{self.run}/receipt/{actor}"
@@ -76,7 +77,7 @@ class Keys:
         return f"vmdnn/{self.run}/live/{actor}"
 
     def metrics(self, role: Role | str = ANYONE, process: str = ANYONE) -> str:
-        """Every process to anyone: its metrics, see `proto.metrics`."""
+        """Every process to anyone: its `Metrics`."""
         return f"vmdnn/{self.run}/metrics/{role}/{process}"
 
     def alive(self, role: Role | str = ANYONE, process: str = ANYONE) -> str:

@@ -1,4 +1,4 @@
-"""Work that is handed out, and handed out again when whoever took it is gone."""
+"""Work that is handed out, and handed out again when its holder is too late or has vanished."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class _Lease:
 
 
 class Leases(Generic[Item]):
-    """Who works on what, until when; used by several threads."""
+    """Who works on which item, until when. Used by several threads."""
 
     def __init__(self, lease_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._lease_s = lease_s
@@ -32,7 +32,7 @@ class Leases(Generic[Item]):
             return len(self._leases)
 
     def take(self, holder: str, wanted: Iterable[Item]) -> Item | None:
-        """Give `holder` the first of the wanted items that nobody works on."""
+        """Lease the first of the wanted items that nobody holds; None if all are held."""
         with self._lock:
             self._drop(lambda lease: lease.until_s <= self._clock())
             item = next((item for item in wanted if item not in self._leases), None)
@@ -41,12 +41,12 @@ class Leases(Generic[Item]):
             return item
 
     def finish(self, item: Item) -> None:
-        """The item is done."""
+        """End the lease of an item, because it is done or has failed."""
         with self._lock:
             self._leases.pop(item, None)
 
     def release(self, holder: str) -> None:
-        """The holder is gone: what it took may be taken again."""
+        """End all leases of a holder that has vanished."""
         with self._lock:
             self._drop(lambda lease: lease.holder == holder)
 

@@ -1,4 +1,4 @@
-"""What machine this is, for benchmarks and their readers."""
+"""The name of this machine's processor, for benchmarks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def machine_name() -> str:
-    """Processor, and how many of its cores this process may use."""
+    """Processor, and the number of cores that this process may use."""
     cores = len(os.sched_getaffinity(0))
     return f"{_processor()}, {cores} core{'s' if cores > 1 else ''}"
 

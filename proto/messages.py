@@ -1,4 +1,4 @@
-"""What the processes say to each other. Fields are checked as their annotations say."""
+"""Messages between the processes. Every field is checked as its annotation says."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Rollout:
     """An episode that a network played, as a trial or for practice, for the evaluator.
 
     Attributes:
-        episode: the whole of it.
+        episode: the episode.
         run_id: training that the policy comes from.
     """
 
@@ -64,23 +64,60 @@ class Rollout:
     run_id: Id
 
 
-@message("receipt", 1)
+@message("episode_failed", 1)
+@dataclass(frozen=True)
+class EpisodeFailed:
+    """An episode that was asked for but whose simulation failed, so that there is no outcome.
+
+    The evaluator counts a trial as a failure. The learner gives up a tutored case or a correction
+    that fails again and again.
+
+    Attributes:
+        id: id of the episode.
+        actor: id of the actor that played it.
+        kind: why it was played; actors report no failure of practice.
+        task: name of the task.
+        seed: seed of the episode.
+        situation: the situation's values by name.
+        training: id of the training that the policy comes from, empty for the tutor.
+        policy_version: version of the policy, 0 for the tutor.
+        problem: what is wrong with the episode.
+    """
+
+    id: Id
+    actor: Id
+    kind: Kind
+    task: Annotated[str, Text(64)]
+    seed: Seed
+    situation: SituationField
+    training: Annotated[str, Text(64)]
+    policy_version: Count
+    problem: Annotated[str, Text(1000)]
+
+
+@message("receipt", 2)
 @dataclass(frozen=True)
 class Receipt:
-    """The episode `episode` has arrived and is kept: it need not be sent again."""
+    """The answer to an episode, or to the report that it failed: it need not be sent again.
+
+    Attributes:
+        episode: id of the episode.
+        refusal: why the receiver will never take it; empty if it is kept, or if an equal one is.
+    """
 
     episode: Id
+    refusal: Annotated[str, Text(1000)] = ""
 
 
 @message("tutoring_request", 2)
 @dataclass(frozen=True)
 class TutoringRequest:
-    """An actor asks for a case to demonstrate, or a situation to be guided in.
+    """An actor asks for a tutored case to demonstrate, or for a situation to be guided in.
 
     Attributes:
-        actor: who asks.
-        run_id: training that its policy comes from, empty if it has none.
-        policy_version: its policy's version, 0 if it has none.
+        actor: id of the actor.
+        run_id: id of the training that its policy comes from, empty if it has no policy.
+        policy_version: version of its policy, 0 if it has none.
     """
 
     actor: Id
@@ -91,10 +128,10 @@ class TutoringRequest:
 @message("tutoring_case", 2)
 @dataclass(frozen=True)
 class TutoringCase:
-    """A case to demonstrate.
+    """A tutored case to demonstrate.
 
     Attributes:
-        task: name of the task; that of pre-training is another than the one that is tested.
+        task: name of the task; pre-training may have a task of its own.
         case: index into the task's tutored situations.
         repeat: 0 for the clean plan, 1, 2, ... for executions with noise.
     """
@@ -112,7 +149,7 @@ class TutoringCase:
 @message("correction", 2)
 @dataclass(frozen=True)
 class Correction:
-    """A situation in which the policy of the request is to act while the tutor guides it.
+    """A situation in which the actor's policy acts while the tutor guides it.
 
     Attributes:
         task: name of the task.
@@ -128,7 +165,7 @@ class Correction:
 @message("verdict", 2)
 @dataclass(frozen=True)
 class Verdict:
-    """How an episode of practice ended; it tells the learner where tutoring is needed.
+    """How an episode of practice ended; the learner tutors where the policy failed.
 
     Attributes:
         run_id: training that the policy comes from.
@@ -150,7 +187,7 @@ class Verdict:
 @message("trial_request", 1)
 @dataclass(frozen=True)
 class TrialRequest:
-    """An actor asks for a trial of the policy that it holds."""
+    """An actor asks for a trial of the policy that it holds; fields as in `TutoringRequest`."""
 
     actor: Id
     run_id: Id
@@ -175,15 +212,15 @@ class Live:
     """One control step as it happens.
 
     Attributes:
-        actor: who plays.
-        kind: why.
+        actor: id of the actor that plays.
+        kind: why the episode is played.
         policy: name of the policy.
-        policy_version: its version.
+        policy_version: version of the policy.
         step: control step, from 0.
         phase: name of the phase.
         image: (48, 64) uint8, the network's grey picture.
         joints_deg: (18,) float32, neck, arm and hand as measured.
-        action: (11,) float32, what the robot is told.
+        action: (11,) float32, the action that the robot executes.
     """
 
     actor: Id
@@ -198,11 +235,11 @@ class Live:
 
 
 class Command(StrEnum):
-    """What a process can be told.
+    """What a process can be asked to do.
 
-    pause: stop playing, training or handing out; keep receiving and answering.
+    pause: stop playing, training or handing out work; keep receiving and answering.
     resume: end the pause.
-    checkpoint: write to disk what a restart would need.
+    checkpoint: write to disk what a restart needs.
     stop: end cleanly.
     """
 
@@ -215,7 +252,7 @@ class Command(StrEnum):
 @message("control", 1, form="json")
 @dataclass(frozen=True)
 class Control:
-    """Tells all processes of a role what to do."""
+    """A command to all processes of a role."""
 
     command: Command
 
@@ -223,11 +260,11 @@ class Control:
 @message("control_reply", 1, form="json")
 @dataclass(frozen=True)
 class ControlReply:
-    """What one process says to a `Control`.
+    """The answer of one process to a `Control`.
 
     Attributes:
-        role: what it is.
-        id: which one it is.
+        role: role of the process.
+        id: id of the process.
         note: what it did.
     """
 

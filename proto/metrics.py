@@ -1,8 +1,4 @@
-"""What each process tells about itself about once a second, as JSON; see docs/protocol.md.
-
-All times are seconds; `time_s` is Unix time. `refused` counts the messages that a process dropped
-because they were not what they should be.
-"""
+"""Metrics that each process publishes about once a second, as JSON; see docs/protocol.md."""
 
 from __future__ import annotations
 
@@ -34,13 +30,13 @@ Fraction = Annotated[float, Number(0.0, 1.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class Metrics:
-    """What all processes tell.
+    """Metrics that all processes have.
 
     Attributes:
-        role: what it is.
-        id: which one it is.
-        time_s: when this was said.
-        refused: messages dropped so far because they were not valid.
+        role: role of the process.
+        id: id of the process.
+        time_s: when the metrics were published (Unix time).
+        refused: number of messages that the process dropped because they were invalid.
     """
 
     role: Role
@@ -52,17 +48,20 @@ class Metrics:
 @message("metrics.actor", 3, form="json")
 @dataclass(frozen=True, kw_only=True)
 class ActorMetrics(Metrics):
-    """An actor.
+    """Metrics of an actor.
 
     Attributes:
         policy_version: newest policy it holds, 0 for none yet.
         steps_per_s: control steps per second since the last metrics.
         episodes: episodes it has finished since it started.
         last_outcome: reason of the last episode, `none` for a precise success; null at first.
-        last_kind: what the last episode was for; null at first.
+        last_kind: why the last episode was played; null at first.
         backend: its simulator.
         outbox: episodes without a receipt.
-        paused: whether it was told to pause.
+        put_aside: messages of the outbox that are kept on disk but not sent any more, because the
+            receiver refused them or the file is damaged.
+        failed: episodes whose simulation failed since the process started.
+        paused: whether it was asked to pause.
     """
 
     role: Role = Role.ACTOR
@@ -73,11 +72,13 @@ class ActorMetrics(Metrics):
     last_kind: Annotated[Kind | None, Maybe(Choice(Kind))]
     backend: str
     outbox: Count
+    put_aside: Count
+    failed: Count
     paused: bool
 
 
 class Stage(StrEnum):
-    """What the learner is at."""
+    """What the learner is doing."""
 
     WAITING = "waiting"
     PRETRAINING = "pretraining"
@@ -85,23 +86,25 @@ class Stage(StrEnum):
     FINISHED = "finished"
 
 
-@message("metrics.learner", 2, form="json")
+@message("metrics.learner", 3, form="json")
 @dataclass(frozen=True, kw_only=True)
 class LearnerMetrics(Metrics):
-    """The learner.
+    """Metrics of the learner.
 
     Attributes:
         stage: waiting for sequences or corrections, pretraining, coupled training, or finished.
         epoch: epochs done in this stage.
         epochs_total: epochs that this stage has.
         loss: loss of the last epoch; null at first.
-        sequences: tutored sequences that it keeps, those of pre-training counted.
+        sequences: sequences that it stores, including those of pre-training.
         round: round of corrections that it waits for or learns from, 0 before the first.
-        corrections: corrections of this round that it keeps; 0 unless it waits for them.
+        corrections: corrections of this round that it stores; 0 unless it waits for them.
         corrections_total: corrections that this round has at most; 0 unless it waits for them.
+        given_up: tutored cases and corrections that are not asked for any more, because their
+            simulation failed again and again; counted since the process started.
         epochs_per_s: epochs per second since the last metrics.
         policy_version: newest version published, 0 for none yet.
-        paused: whether it was told to pause.
+        paused: whether it was asked to pause.
         done: whether what the configuration's `done` asks of the learner is reached.
     """
 
@@ -114,6 +117,7 @@ class LearnerMetrics(Metrics):
     round: Count
     corrections: Count
     corrections_total: Count
+    given_up: Count
     epochs_per_s: Rate
     policy_version: Count
     paused: bool
@@ -122,11 +126,11 @@ class LearnerMetrics(Metrics):
 
 @dataclass(frozen=True)
 class Success:
-    """How many trials succeeded, by one reading.
+    """How many trials succeeded, in one of the readings of success.
 
     Attributes:
-        successes: number of trials that did.
-        rate: their share.
+        successes: number of successful trials.
+        rate: their share of all trials.
         wilson95: low and high end of the 95 % Wilson interval of the rate.
     """
 
@@ -157,12 +161,12 @@ class PolicyScore:
 @message("metrics.evaluator", 1, form="json", limit=4 * MEBIBYTE)
 @dataclass(frozen=True, kw_only=True)
 class EvaluatorMetrics(Metrics):
-    """The evaluator.
+    """Metrics of the evaluator.
 
     Attributes:
         policies: counts of each policy version that was tried, oldest first.
-        leases: trials that are being played now.
-        paused: whether it was told to pause.
+        leases: trials that are being played.
+        paused: whether it was asked to pause.
         done: whether what the configuration's `done` asks of the evaluator is reached.
     """
 
@@ -178,12 +182,12 @@ class EvaluatorMetrics(Metrics):
 @message("metrics.recorder", 1, form="json")
 @dataclass(frozen=True, kw_only=True)
 class RecorderMetrics(Metrics):
-    """The recorder.
+    """Metrics of the recorder.
 
     Attributes:
         episodes: episodes written since it started.
         bytes: bytes written since it started.
-        dropped: rollouts that it could not keep up with, or not write.
+        dropped: rollouts that it did not record, because too many waited or writing failed.
     """
 
     role: Role = Role.RECORDER
@@ -195,7 +199,7 @@ class RecorderMetrics(Metrics):
 @message("metrics.hub", 1, form="json")
 @dataclass(frozen=True, kw_only=True)
 class HubMetrics(Metrics):
-    """The hub.
+    """Metrics of the hub.
 
     Attributes:
         peers: sessions connected to it.

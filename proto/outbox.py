@@ -13,7 +13,7 @@ from typing import Final
 
 from proto.codec import Wire
 from proto.errors import UserError
-from proto.storage import change_suffix, make_folder, written_whole
+from proto.storage import change_suffix, make_folder, parts_in, written_whole
 
 LOG = logging.getLogger(__name__)
 
@@ -67,7 +67,8 @@ class Outbox:
         """Find the messages in a folder.
 
         Args:
-            folder: where the messages are kept; it is made if it is missing.
+            folder: where the messages are kept; it is made if it is missing. No other process may
+                use it.
             send: sends a message under a key.
             resend_after_s: time to wait for the first answer.
             clock: gives the time in seconds.
@@ -76,6 +77,8 @@ class Outbox:
             UserError: the folder cannot be made.
         """
         make_folder(folder)
+        for unfinished in parts_in(folder):
+            unfinished.unlink()
         self._folder = folder
         self._send = send
         self._resend_after_s = resend_after_s
@@ -119,14 +122,12 @@ class Outbox:
         entry = self._answered(name)
         if entry is not None:
             entry.path.unlink(missing_ok=True)
-        self.send_due()
 
     def refused(self, name: str, reason: str) -> None:
         """Put a message aside that the receiver will never take. Unknown names are ignored."""
         entry = self._answered(name)
         if entry is not None:
             self._set_aside(entry.path, ".refused", f"was refused: {reason}")
-        self.send_due()
 
     def send_due(self) -> None:
         """Send what was not sent yet, and again what should have been answered by now."""
@@ -184,5 +185,6 @@ class Outbox:
         except UserError as error:
             LOG.warning("%s %s, but cannot be put aside: %s", path, problem, error)
             return
-        self._put_aside += 1
+        with self._lock:
+            self._put_aside += 1
         LOG.warning("a message %s; it is kept in %s and not sent again", problem, aside)

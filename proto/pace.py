@@ -1,4 +1,4 @@
-"""How fast something goes."""
+"""Measuring how often something happens per second."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import time
 
 
 class Pace:
-    """Counts in one thread, tells in another."""
+    """Counts events in one thread, and gives their rate to another."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -15,12 +15,12 @@ class Pace:
         self._since_s = time.monotonic()
 
     def add(self, count: int = 1) -> None:
-        """So many more were done."""
+        """Count events."""
         with self._lock:
             self._count += count
 
     def per_second(self) -> float:
-        """How many a second were done since the last time this was asked."""
+        """Events per second since the last call."""
         with self._lock:
             now = time.monotonic()
             pace = self._count / max(now - self._since_s, 1e-6)

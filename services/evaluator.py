@@ -14,7 +14,15 @@ from proto.keys import Role
 from proto.leases import Leases
 from proto.lifecycle import Lifecycle
 from proto.membership import alone_in_run, membership
-from proto.messages import PolicyVersion, Receipt, Rollout, Trial, TrialRequest, Verdict
+from proto.messages import (
+    EpisodeFailed,
+    PolicyVersion,
+    Receipt,
+    Rollout,
+    Trial,
+    TrialRequest,
+    Verdict,
+)
 from proto.metrics import EvaluatorMetrics, PolicyScore, Success
 from services.trials.success import Tally
 from services.trials.trial_log import TrialLog
@@ -22,22 +30,27 @@ from services.trials.trial_log import TrialLog
 LOG = logging.getLogger(__name__)
 
 WAITING: Final = 64
-"""Rollouts that may wait to be counted; more are dropped, and sent again by their actors."""
+"""Messages that may wait to be handled; more are dropped, and sent again by their actors."""
 IDLE_S: Final = 0.5
+"""How often to look whether it should stop, while no rollout arrives."""
 
 PolicyKey = tuple[str, int]
-"""A policy's training and version."""
+"""Id of a policy's training, and its version."""
 
 
 class Evaluator:
-    """Gives every policy version the same situations, and counts each trial once."""
+    """Tries every policy version in the same situations, and counts each trial once."""
 
     def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
-        """Find what was counted before in the run's folder."""
+        """Read the trials that were counted before from the run's folder.
+
+        Raises:
+            UserError: they cannot be read.
+        """
         self._config = config
         self._bus = bus
         self._lifecycle = lifecycle
-        self._book = TrialLog(config.run_folder / "evaluation" / "trials.jsonl")
+        self._log = TrialLog(config.run_folder / "evaluation" / "trials.jsonl")
         self._leases: Leases[tuple[PolicyKey, int]] = Leases(config.evaluator.lease_s)
         first = config.evaluator.seed
         self._seeds = range(first, first + config.evaluator.trials_per_policy)
@@ -47,20 +60,22 @@ class Evaluator:
         """Evaluate until it should stop.
 
         Raises:
-            UserError: the run has an evaluator already.
+            UserError: the run has an evaluator already, or a trial cannot be written to disk.
         """
         alone_in_run(self._bus, self._lifecycle)
         keys = self._bus.keys
-        inbox = self._bus.inbox(keys.rollout(), Rollout, capacity=WAITING)
+        rollouts = self._bus.inbox(keys.rollout(), Rollout, capacity=WAITING)
+        failures = self._bus.inbox(keys.failure(), EpisodeFailed, capacity=WAITING)
         self._bus.subscribe_newest(keys.policy, self._on_policy, PolicyVersion)
         self._bus.answer(keys.request_trial, TrialRequest, self._hand_out)
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
         with membership(self._bus, self, self._lifecycle):
             while not self._lifecycle.stopping:
-                self._receive(inbox)
+                self._receive(rollouts)
+                self._receive_failures(failures)
 
     def metrics(self) -> EvaluatorMetrics:
-        """What it tells about itself."""
+        """Metrics at this moment."""
         run_id, _ = self._newest
         return EvaluatorMetrics(
             id=self._bus.id,
@@ -68,7 +83,7 @@ class Evaluator:
             refused=self._bus.refused,
             policies=tuple(
                 _score(version, self._counted((run_id, version)).values())
-                for version in self._book.versions(run_id)
+                for version in self._log.versions(run_id)
             ),
             leases=len(self._leases),
             paused=self._lifecycle.paused,
@@ -76,7 +91,7 @@ class Evaluator:
         )
 
     def checkpoint(self) -> str:
-        """Nothing is to be saved: each trial is on disk as soon as it is counted."""
+        """Write nothing: each trial is on disk as soon as it is counted."""
         return "every counted trial is on disk"
 
     @property
@@ -112,34 +127,49 @@ class Evaluator:
         if rollout is None:
             return
         episode = rollout.episode
-        if self._is_trial(episode):
+        refusal = self._refusal(episode)
+        if not refusal and episode.kind is Kind.TRIAL:
             self._leases.finish(((rollout.run_id, episode.policy_version), episode.seed))
-            if self._book.add(rollout):
-                LOG.info(
-                    "policy %d, trial %d: %s",
-                    episode.policy_version,
-                    episode.seed,
-                    episode.outcome.reason,
-                )
-        elif self._is_practice(episode):
+            if self._log.add(rollout):
+                _report_trial(episode.policy_version, episode.seed, episode.outcome.reason)
+        elif not refusal:
             self._bus.deliver(self._bus.keys.verdict, _verdict(rollout))
-        # Practice and what was counted already need not be sent again either.
-        self._bus.deliver(self._bus.keys.receipt(episode.actor), Receipt(episode.id))
+        # A trial that was counted before gets its receipt again.
+        self._answer(episode.actor, Receipt(episode.id, refusal))
 
-    def _is_trial(self, episode: Episode) -> bool:
-        """Whether it is one of the trials that this configuration asks for."""
-        return self._is(Kind.TRIAL, episode) and episode.seed in self._seeds
+    def _receive_failures(self, inbox: Inbox[EpisodeFailed]) -> None:
+        while (report := inbox.take()) is not None:
+            if report.kind is not Kind.TRIAL:  # the learner answers it
+                continue
+            refusal = self._refusal(report)
+            if not refusal:
+                self._leases.finish(((report.training, report.policy_version), report.seed))
+                if self._log.add_failure(report):
+                    _report_trial(report.policy_version, report.seed, report.problem)
+            self._answer(report.actor, Receipt(report.id, refusal))
 
-    def _is_practice(self, episode: Episode) -> bool:
-        """Whether the learner may hear of it: never of the situations of trials."""
-        return self._is(Kind.PRACTICE, episode) and episode.seed not in self._seeds
+    def _refusal(self, played: Episode | EpisodeFailed) -> str:
+        """Why an episode is no trial and no practice of this run; empty if it is one."""
+        if played.task != self._config.task.name:
+            return f"this run tests {self._config.task.name}, not {played.task}"
+        if played.kind is Kind.TRIAL and played.seed not in self._seeds:
+            return f"no trial with the seed {played.seed} is asked for"
+        if played.kind is Kind.PRACTICE and played.seed in self._seeds:
+            return f"the situation with the seed {played.seed} is one of trials, not of practice"
+        if played.kind not in (Kind.TRIAL, Kind.PRACTICE):
+            return f"an episode of the kind {played.kind} is not evaluated"
+        return ""
 
-    def _is(self, kind: Kind, episode: Episode) -> bool:
-        return episode.kind is kind and episode.task == self._config.task.name
+    def _answer(self, actor: str, receipt: Receipt) -> None:
+        self._bus.deliver(self._bus.keys.receipt(actor), receipt)
 
     def _counted(self, policy: PolicyKey) -> Mapping[int, Outcome]:
-        outcomes = self._book.outcomes(*policy)
+        outcomes = self._log.outcomes(*policy)
         return {seed: outcome for seed, outcome in outcomes.items() if seed in self._seeds}
+
+
+def _report_trial(policy_version: int, seed: int, result: str) -> None:
+    LOG.info("policy %d, trial %d: %s", policy_version, seed, result)
 
 
 def _verdict(rollout: Rollout) -> Verdict:

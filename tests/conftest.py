@@ -14,6 +14,7 @@ from outcomes import IMPRECISE
 from actors.tasks.experiment1.world import SUBTASKS
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
 from proto.episode import Episode, Kind
+from proto.messages import EpisodeFailed
 
 # how long an example takes says more of what else the machine does than of the code
 settings.register_profile("patient", deadline=None)
@@ -53,5 +54,26 @@ def make_episode() -> Callable[..., Episode]:
             outputs=random.random((steps, 110), dtype=np.float32),
         )
         return replace(episode, **given)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def failure() -> Callable[..., EpisodeFailed]:
+    """Make the report that a simulation failed; fields can be given by name."""
+
+    def make(name: str, **given: Any) -> EpisodeFailed:
+        report = EpisodeFailed(
+            id=name,
+            actor="actor",
+            kind=Kind.TUTORING,
+            task="experiment1",
+            seed=0,
+            situation={"object_y_m": 0.25},
+            training="",
+            policy_version=0,
+            problem="episode.joints_deg: expected finite numbers, got NaN or infinity",
+        )
+        return replace(report, **given)
 
     return make

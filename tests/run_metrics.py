@@ -19,12 +19,12 @@ RUN = "watched"
 ACTOR = ActorMetrics(
     id="a-1", time_s=1.0, refused=0, policy_version=3, steps_per_s=81.25, episodes=17,
     last_outcome="moved_object", last_kind=Kind.TRIAL, backend="sapien", outbox=2,
-    paused=False,
+    put_aside=0, failed=0, paused=False,
 )  # fmt: skip
 LEARNER = LearnerMetrics(
     id="l", time_s=1.0, refused=0, stage=Stage.COUPLED, epoch=120, epochs_total=2500, loss=0.4321,
-    sequences=45, round=0, corrections=0, corrections_total=0, epochs_per_s=12.5, policy_version=3,
-    paused=False, done=False,
+    sequences=45, round=0, corrections=0, corrections_total=0, given_up=0, epochs_per_s=12.5,
+    policy_version=3, paused=False, done=False,
 )  # fmt: skip
 
 

@@ -1,12 +1,13 @@
-"""What can be told of a situation from what the vision makes of it.
+"""How well a situation can be read from the activity of the vision.
 
-Two ways of asking: the classifier of pre-training, which had to learn just this, and a linear
-regression from V_S, which tells how far its features also tell what lies between the classes.
+Two measures: the classifier of pre-training, and a linear regression from V_S. The classifier was
+trained for this. The regression shows whether V_S also distinguishes situations between the
+classes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,27 +19,27 @@ from learner.checkpoint import CLASSIFIER_PREFIX, NETWORK_PREFIX, Checkpoint, Cl
 from learner.network.mtrnn import run_levels
 from learner.network.vision_input import vision_input
 from learner.network.vmdnn import VMDNN
+from learner.tensors import to_tensors
 from proto.episode import Episode
 from proto.errors import UserError
-from proto.variables import Value, number_of
+from proto.variables import number_of
 
 Array = NDArray[np.float64]
 
 PENALTIES: Final = np.logspace(-7, 1, 17)
-"""Of the regression, as parts of the features' mean square."""
+"""Penalties of the regression that are tried, as fractions of the features' mean square."""
 
 
 @dataclass(frozen=True)
-class Answer:
-    """How well the classifier answered for a variable, at the end of the window of its question.
+class ClassifierScore:
+    """How well the classifier read a variable, at the end of the window of its question.
 
     Attributes:
         value: name of the variable.
         classes: how many there are.
-        right: share of sequences for which the right class, or the nearest one, got the highest
-            answer.
-        error: mean distance of the truth from the mean of the classes under the answer; None for a
-            discrete variable.
+        right: fraction of sequences for which the nearest class got the highest probability.
+        error: mean distance of the value from the mean of the classes under the probabilities; None
+            for a discrete variable.
     """
 
     value: str
@@ -48,14 +49,14 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Probe:
-    """How well a regression from V_S at the end of a phase tells a value of other sequences.
+class RegressionScore:
+    """How well a regression from V_S at the end of a phase predicts a value of other sequences.
 
     Attributes:
         phase: name of the phase.
-        value: name of the situation's value.
-        error: mean distance from the truth.
-        blind_error: the same for whoever sees nothing and says the mean.
+        value: name of the variable.
+        error: mean distance of the prediction from the value.
+        blind_error: the same for a prediction without vision, the mean of the learned sequences.
     """
 
     phase: str
@@ -68,16 +69,15 @@ class Vision:
     """V_F and V_S of a checkpoint and, if it is from pre-training, its classifier.
 
     Attributes:
-        classes: the classifier's classes by name of the variable; empty without a classifier.
+        asked: what the classifier was asked, by name of the variable; empty without a classifier.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
         training = checkpoint.metadata.training
-        self.classes = {} if training is None else training.classes
-        self._windows = {} if training is None else training.windows
+        self.asked = {} if training is None else training.asked
         self._network = VMDNN(checkpoint.metadata.network)
-        self._network.load_state_dict(_tensors(checkpoint, NETWORK_PREFIX))
-        self._classifier = _tensors(checkpoint, CLASSIFIER_PREFIX)
+        self._network.load_state_dict(to_tensors(checkpoint.part(NETWORK_PREFIX)))
+        self._classifier = to_tensors(checkpoint.part(CLASSIFIER_PREFIX))
 
     @torch.no_grad()
     def see(self, episode: Episode) -> NDArray[np.float32]:
@@ -86,56 +86,63 @@ class Vision:
         return np.asarray(self._network.see(images[None])[0])
 
     @torch.no_grad()
-    def answer(self, seen: NDArray[np.float32]) -> dict[str, Array]:
-        """What the classifier says about V_S (T, units): shares (classes,) by name of the variable.
+    def classify(self, seen: NDArray[np.float32]) -> dict[str, Array]:
+        """Probabilities of the classes of each variable for V_S (T, units), by its name.
 
-        Each answer is that at the end of the window in which the variable is asked for.
+        They are those at the end of the window in which the variable is asked for.
         """
         pfc = run_levels([self._network.pfc], torch.from_numpy(seen)[None], "bottom_up")[0]
-        sizes = [len(classes) for classes in self.classes.values()]
-        starts = np.cumsum([0, *sizes])
-        answers = {}
-        for name, start, size in zip(self.classes, starts, sizes, strict=False):
-            _, window_end = self._windows.get(name, (0.0, 1.0))
-            step = max(int(len(seen) * window_end) - 1, 0)
-            rows = slice(start, start + size)
-            sums = self._classifier["weight"][rows] @ pfc[step] + self._classifier["bias"][rows]
-            answers[name] = np.asarray(torch.softmax(sums.double(), dim=0))
-        return answers
+        sums = pfc @ self._classifier["weight"].T + self._classifier["bias"]
+        parts = torch.split(sums, [len(each.classes) for each in self.asked.values()], dim=1)
+        probabilities = {}
+        for (name, each), part in zip(self.asked.items(), parts, strict=True):
+            last = max(int(len(seen) * each.window[1]) - 1, 0)
+            probabilities[name] = np.asarray(torch.softmax(part[last].double(), dim=0))
+        return probabilities
 
 
-def ask_classifier(vision: Vision, episodes: Sequence[Episode]) -> list[Answer]:
-    """How well the classifier answers, value by value; nothing if there is none."""
-    said = [vision.answer(vision.see(episode)) for episode in episodes] if vision.classes else []
-    answers = []
-    for name, classes in vision.classes.items():
-        shares = np.stack([answer[name] for answer in said])
-        truth = [episode.situation[name] for episode in episodes]
-        answers.append(_answer(name, classes, shares, truth))
-    return answers
+def score_classifier(vision: Vision, episodes: Sequence[Episode]) -> list[ClassifierScore]:
+    """How well the classifier reads each variable; empty without a classifier."""
+    if not vision.asked:
+        return []
+    probabilities = [vision.classify(vision.see(episode)) for episode in episodes]
+    return [
+        _score(name, asked.classes, np.stack([each[name] for each in probabilities]), episodes)
+        for name, asked in vision.asked.items()
+    ]
 
 
-def _answer(name: str, classes: Classes, shares: Array, truth: Sequence[Value]) -> Answer:
-    """How well answers (N, classes) fit the true values of a variable."""
-    said = shares.argmax(1)
+def _score(
+    name: str, classes: Classes, shares: Array, episodes: Sequence[Episode]
+) -> ClassifierScore:
+    """The score of probabilities (N, classes) of a variable's classes in N episodes."""
+    answers = shares.argmax(1)
     if isinstance(classes[0], str):
-        right = np.array(
-            [classes[index] == value for index, value in zip(said, truth, strict=True)]
-        )
-        return Answer(name, len(classes), float(right.mean()), None)
-    centres, values = np.asarray(classes, float), np.asarray(truth, float)
-    right = said == np.abs(values[:, None] - centres).argmin(1)
+        truth = [classes.index(str(episode.situation[name])) for episode in episodes]
+        right = float(np.mean(answers == np.array(truth)))
+        return ClassifierScore(name, len(classes), right, error=None)
+    centres, values = np.asarray(classes, np.float64), _values(episodes, name)
+    nearest = np.abs(values[:, None] - centres).argmin(1)
     error = float(np.abs(shares @ centres - values).mean())
-    return Answer(name, len(classes), float(right.mean()), error)
+    return ClassifierScore(name, len(classes), float((answers == nearest).mean()), error)
 
 
-def probe(vision: Vision, learned: Sequence[Episode], tested: Sequence[Episode]) -> list[Probe]:
-    """What V_S tells at the end of each phase: regression on `learned`, errors on `tested`.
+def score_regression(
+    vision: Vision, learned: Sequence[Episode], tested: Sequence[Episode]
+) -> list[RegressionScore]:
+    """How well V_S at the end of each phase predicts each value, by linear regression.
 
-    Discrete variables are left out, and those that never change in `learned` or that some lack.
+    Args:
+        vision: the vision.
+        learned: sequences that the regression is fitted to.
+        tested: sequences that it is tested on.
+
+    Returns:
+        Scores by phase and variable. Discrete variables are left out, and those that are the same
+        in all of `learned` or missing in some episode.
 
     Raises:
-        UserError: there is no such value, or no phase that all episodes have.
+        UserError: no value is left, or no phase occurs in all episodes.
     """
     values = _common_values([*learned, *tested])
     values = [value for value in values if np.ptp(_values(learned, value)) > 0]
@@ -144,7 +151,7 @@ def probe(vision: Vision, learned: Sequence[Episode], tested: Sequence[Episode])
     phases = [phase for phase in seen[0] if phase in shared]
     if not values or not phases:
         raise UserError("the sequences have no phase, or no varying value, in common")
-    probes = []
+    scores = []
     for phase in phases:
         features, features_tested = (
             np.stack([ends[phase] for ends in each]).astype(np.float64)
@@ -152,17 +159,17 @@ def probe(vision: Vision, learned: Sequence[Episode], tested: Sequence[Episode])
         )
         for value in values:
             known, truth = _values(learned, value), _values(tested, value)
-            told = ridge_regression(features, known, features_tested)
-            error, blind = (np.abs(said - truth).mean() for said in (told, known.mean()))
-            probes.append(Probe(phase, value, float(error), float(blind)))
-    return probes
+            predicted = ridge_regression(features, known, features_tested)
+            error, blind = (np.abs(each - truth).mean() for each in (predicted, known.mean()))
+            scores.append(RegressionScore(phase, value, float(error), float(blind)))
+    return scores
 
 
 def ridge_regression(features: Array, values: Array, others: Array) -> Array:
-    """Predict the values (m,) of others (m, F) from features (n, F) and their values (n,).
+    """Predict values (m,) for features (m, F) from features (n, F) and their values (n,).
 
-    Of the penalties the one is taken with which everything with one value is told best from all
-    that has other values: it should tell what lies between the values that it knows.
+    The penalty is chosen by cross-validation: all samples with one value are left out together, so
+    that the regression is judged by values that it has not seen.
     """
     mean_features, mean = features.mean(0), values.mean()
     centred = features - mean_features
@@ -178,7 +185,7 @@ def ridge_regression(features: Array, values: Array, others: Array) -> Array:
 
 
 def _left_out_error(smoother: Array, values: Array) -> float:
-    """Squared error of what is told of all with one value by those that have other values.
+    """Squared error of cross-validation in which all samples with one value are left out together.
 
     For a linear smoother (n, n) it follows from the residues with nothing left out.
     """
@@ -209,7 +216,3 @@ def _common_values(episodes: Sequence[Episode]) -> list[str]:
 
 def _values(episodes: Sequence[Episode], value: str) -> Array:
     return np.array([number_of(episode.situation, value) for episode in episodes])
-
-
-def _tensors(checkpoint: Checkpoint, prefix: str) -> Mapping[str, torch.Tensor]:
-    return {name: torch.tensor(array) for name, array in checkpoint.part(prefix).items()}

@@ -1,4 +1,4 @@
-"""Which situations a policy is guided in, and who is at it (dataset aggregation)."""
+"""In which situations a policy is guided, and which actor plays which (dataset aggregation)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import threading
 from collections.abc import Sequence
 from typing import Protocol
 
+from learner.tutoring.failures import Failures, Shown
 from proto.config import Config
-from proto.episode import Episode, Kind
+from proto.episode import Kind
 from proto.leases import Leases
-from proto.messages import Correction, TutoringRequest, Verdict
+from proto.messages import Correction, EpisodeFailed, TutoringRequest, Verdict
 from proto.seeds import CORRECTIONS
 from proto.variables import Question, Situation
 
-Policy = tuple[str, int]
-"""A policy's training and version."""
+PolicyKey = tuple[str, int]
+"""Id of a policy's training, and its version."""
 
 
 class Situations(Protocol):
@@ -28,31 +29,34 @@ class Situations(Protocol):
     questions: tuple[Question, ...]
 
     def tutored(self) -> Sequence[Situation]:
-        """Those that are tutored, always in the same order."""
+        """The tutored situations, always in the same order."""
 
     def sample(self, seed: int) -> Situation:
-        """Any other; the same seed gives the same."""
+        """A random situation; the same seed gives the same one."""
 
 
 class Round:
     """Corrections of one policy version, each wanted once. Used by several threads.
 
-    After a restart what is kept still counts, and random and tutored situations are the same ones;
-    failures that nobody was guided in yet are forgotten, and looked for again.
+    After a restart the kept corrections still count, and random and tutored situations are the
+    same as before. Failed situations that were not corrected yet are forgotten: practice has to
+    find such situations again.
 
     Attributes:
-        number: which round it is, from 1.
-        most: number of corrections that it has at most.
+        number: number of the round, from 1.
+        most: number of corrections that the round has at most.
     """
 
-    def __init__(self, config: Config, number: int, policy: Policy, situations: Situations) -> None:
+    def __init__(
+        self, config: Config, number: int, policy: PolicyKey, situations: Situations
+    ) -> None:
         """Plan a round.
 
         Args:
             config: the configuration.
-            number: which round it is, from 1.
-            policy: the newest policy; no other is guided.
-            situations: those of the configuration's task.
+            number: number of the round, from 1.
+            policy: the newest policy, which is guided.
+            situations: situations of the configuration's task.
         """
         corrections = config.learner.corrections
         self.number = number
@@ -64,38 +68,41 @@ class Round:
         self._missing = {plan.seed: plan for plan in planned}
         self._kept: set[int] = set()
         self._judged: set[int] = set()
+        self._given_up: set[int] = set()
+        self._failures: Failures[int] = Failures()
         self._leases: Leases[int] = Leases(config.learner.lease_s)
         self._lock = threading.Lock()
 
     @property
     def kept(self) -> int:
-        """Number of its corrections that are there."""
+        """Number of corrections that are kept."""
         return len(self._kept)
 
     @property
     def judged(self) -> int:
-        """Number of episodes of practice of its policy whose outcome is known."""
+        """Number of episodes of practice of the policy whose outcome is known."""
         return len(self._judged)
 
     @property
     def complete(self) -> bool:
-        """Whether all its corrections are there, and no more are looked for."""
+        """Whether all corrections are kept, and no further failures are waited for."""
         with self._lock:
             return not self._missing and not self._searching
 
     def judge(self, verdict: Verdict) -> None:
-        """Take note of how an episode of practice ended."""
+        """Note how an episode of practice ended; a failure becomes a correction to ask for."""
         with self._lock:
             ours = (verdict.run_id, verdict.policy_version) == self._policy
             if not ours or verdict.task != self._task or not self._searching:
                 return
             self._judged.add(verdict.seed)
-            if not verdict.outcome.precise and verdict.seed not in self._kept:
+            done = self._kept | self._given_up
+            if not verdict.outcome.precise and verdict.seed not in done:
                 plan = Correction(verdict.task, verdict.seed, verdict.situation)
                 self._missing[verdict.seed] = plan
 
     def next_correction(self, request: TutoringRequest) -> Correction | None:
-        """A situation for whoever asks; None if nothing is left, or it holds another policy."""
+        """A situation for an actor; None if none is left, or if the actor has another policy."""
         if (request.run_id, request.policy_version) != self._policy:
             return None
         with self._lock:
@@ -103,30 +110,50 @@ class Round:
             return None if seed is None else self._missing[seed]
 
     def release(self, actor: str) -> None:
-        """The actor is gone: what it was playing is handed out again."""
+        """Hand out again what an actor that vanished was playing."""
         self._leases.release(actor)
 
-    def wants(self, episode: Episode) -> bool:
-        """Whether an episode is a correction of this round that is not kept yet."""
+    def wants(self, shown: Shown) -> bool:
+        """Whether a sequence is a correction of this round that is not kept yet."""
         with self._lock:
-            return self._lacks(episode)
+            return self._lacks(shown)
 
-    def shown(self, episode: Episode) -> None:
-        """This episode is kept: nobody need be guided in its situation any more."""
+    def keep(self, shown: Shown) -> None:
+        """Note that a sequence is kept: its situation need not be corrected any more."""
         with self._lock:
-            if self._lacks(episode):
-                self._missing.pop(episode.seed, None)
-                self._kept.add(episode.seed)
-                self._leases.finish(episode.seed)
+            if self._lacks(shown):
+                self._missing.pop(shown.seed, None)
+                self._kept.add(shown.seed)
+                self._leases.finish(shown.seed)
 
-    def _lacks(self, episode: Episode) -> bool:
+    def fail(self, report: EpisodeFailed) -> bool:
+        """Note that the simulation of a correction failed; whether it is given up for that.
+
+        Otherwise it is handed out again.
+        """
+        with self._lock:
+            if not self._is_of_policy(report) or report.seed not in self._missing:
+                return False
+            self._leases.finish(report.seed)
+            if not self._failures.add(report.seed, report.id):
+                return False
+            del self._missing[report.seed]
+            self._given_up.add(report.seed)
+            return True
+
+    def _lacks(self, shown: Shown) -> bool:
         return (
-            episode.kind is Kind.CORRECTION
-            and episode.task == self._task
-            and episode.policy_version == self._policy[1]
-            and episode.seed not in self._kept
-            # one that was asked for before a restart is welcome
-            and (episode.seed in self._missing or not self._full)
+            self._is_of_policy(shown)
+            and shown.seed not in self._kept
+            # a correction that was asked for before a restart is accepted as well
+            and (shown.seed in self._missing or not self._full)
+        )
+
+    def _is_of_policy(self, shown: Shown) -> bool:
+        return (
+            shown.kind is Kind.CORRECTION
+            and shown.task == self._task
+            and (shown.training, shown.policy_version) == self._policy
         )
 
     @property
@@ -139,7 +166,7 @@ class Round:
 
 
 def _chosen(config: Config, number: int, situations: Situations) -> list[Correction]:
-    """The situations of a round that are known when it begins."""
+    """The corrections of a round that are known when it begins."""
     corrections, task = config.learner.corrections, config.task.name
     match corrections.choose:
         case "failures":

@@ -1,4 +1,4 @@
-"""Which sequences of a store a training takes in, and in which order."""
+"""Which sequences of a store a training learns from, and in which order."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.variables import Value
 
-_log = logging.getLogger(__name__)
+LOG = logging.getLogger(__name__)
 
 
 class Intake:
-    """Hands out each sequence of a store once, and none that cannot be learned from.
+    """Gives each sequence of a store to the training once, except those it cannot learn from.
 
     Attributes:
-        taken: ids of the sequences handed out, in that order.
-        situations: the situations that they show, each once.
-        refused: why the others of the store cannot be learned from, by id.
+        taken: ids of the sequences given so far, in that order.
+        situations: the different situations of these sequences.
+        refused: why the other sequences cannot be learned from, by id.
     """
 
     def __init__(self, store: TutoringStore, task: str, variables: Iterable[str] = ()) -> None:
-        """Take in from `store`.
+        """Take sequences from `store`.
 
         Args:
             store: the sequences.
@@ -40,16 +40,16 @@ class Intake:
         self.refused: dict[str, str] = {}
 
     def new(self) -> list[Episode]:
-        """Sequences that came in since the last call, ordered by id."""
+        """Sequences that were added since the last call, ordered by id."""
         known = {*self.taken, *self.refused}
         return self._take(name for name in self._store.ids if name not in known)
 
     def again(self, sequences: Iterable[str]) -> list[Episode]:
-        """These sequences in this order, as they were taken before a restart."""
+        """The sequences with these ids, in this order, as they were taken before a restart."""
         wanted = tuple(sequences)
         episodes = self._take(wanted)
         if len(episodes) < len(wanted):
-            _log.warning(
+            LOG.warning(
                 "%d of %d sequences of the checkpoint are gone; training goes on without them,"
                 " not exactly as it would have",
                 len(wanted) - len(episodes),
@@ -58,7 +58,7 @@ class Intake:
         return episodes
 
     def complaint(self) -> str:
-        """Why there is nothing to learn from, and what to do."""
+        """Why the store has no sequence to learn from, and what to do."""
         problems = {**self._store.damaged, **self.refused}
         folder = self._store.folder
         if not problems:
@@ -75,7 +75,7 @@ class Intake:
             try:
                 self._check(episode)
             except UserError as error:
-                _log.warning("tutoring sequence refused: %s", error)
+                LOG.warning("tutoring sequence refused: %s", error)
                 self.refused[sequence] = str(error)
                 continue
             episodes.append(episode)

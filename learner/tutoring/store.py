@@ -1,26 +1,35 @@
-"""Every tutored sequence on disk: one MCAP file each, named by the episode's id."""
+"""Tutored sequences on disk: one MCAP file each, named by the episode's id."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Lock
+from typing import TypeVar
 
 from proto.episode import Episode
 from proto.errors import UserError
-from proto.recordings.episodes import read_episode, write_episode
+from proto.recordings.episodes import (
+    EpisodeSummary,
+    read_episode,
+    read_summary,
+    write_episode,
+)
 
-_log = logging.getLogger(__name__)
+LOG = logging.getLogger(__name__)
+
+Read = TypeVar("Read")
 
 
 class TutoringStore:
-    """Sequences in a folder; they are there again when a store of that folder is made again.
+    """The sequences in a folder; another store of the same folder has the same ones.
 
-    May be added to in one thread and read in another. A file that cannot be read is left where it
-    is, reported once, and counts as missing: its episode may be added again.
+    One thread may add while another reads. A file that cannot be read is left where it is, logged
+    once, and counts as missing: its episode may be added again.
 
     Attributes:
-        folder: where the files are; it need not exist before the first one.
+        folder: where the files are; it is made for the first one.
         damaged: what is wrong with each file that could not be read, by id.
     """
 
@@ -40,7 +49,7 @@ class TutoringStore:
             return tuple(sorted(self._ids))
 
     def add(self, episode: Episode) -> bool:
-        """Keep an episode; it is on disk on return. False if it was there already.
+        """Write an episode to disk. False if the store has it already.
 
         Raises:
             UserError: it cannot be written.
@@ -55,10 +64,20 @@ class TutoringStore:
 
     def load(self, sequence: str) -> Episode | None:
         """Read an episode by its id; None if its file is missing or damaged."""
+        return self._read(sequence, read_episode)
+
+    def summaries(self) -> Iterator[EpisodeSummary]:
+        """What each sequence is, without its steps; missing and damaged files are left out."""
+        for sequence in self.ids:
+            summary = self._read(sequence, read_summary)
+            if summary is not None:
+                yield summary
+
+    def _read(self, sequence: str, read: Callable[[Path], Read]) -> Read | None:
         try:
-            return read_episode(self._path(sequence))
+            return read(self._path(sequence))
         except UserError as error:
-            _log.warning("tutoring sequence ignored: %s", error)
+            LOG.warning("tutored sequence ignored: %s", error)
             with self._lock:
                 self._ids.discard(sequence)
                 self.damaged[sequence] = str(error)

@@ -118,15 +118,59 @@ def read_episode(path: Path, *, partial: bool = False) -> Episode:
         expected = int(contents.metadata["episode"]["steps"])
         episode = _episode(contents)
     except (KeyError, ValueError, TypeError, AttributeError, DecodeError) as error:
+        raise _not_an_episode(path, error) from error
+    if not partial:
+        _check_steps(path, episode.steps, expected)
+    return episode
+
+
+def _not_an_episode(path: Path, error: Exception) -> UserError:
+    return UserError(
+        f"{path} is an MCAP file, but no episode that this version can read ({error!r})"
+    )
+
+
+def _check_steps(path: Path, steps: int, expected: int) -> None:
+    if steps != expected:
         raise UserError(
-            f"{path} is an MCAP file, but no episode that this version can read ({error!r})"
-        ) from error
-    if episode.steps != expected and not partial:
-        raise UserError(
-            f"{path} holds {episode.steps} of {expected} steps, recovered from a file that was cut "
+            f"{path} holds {steps} of {expected} steps, recovered from a file that was cut "
             f"off. `vmdnn replay` can show it; for training or counting, play the episode again."
         )
-    return episode
+
+
+@dataclass(frozen=True)
+class EpisodeSummary:
+    """What tells one recorded episode from another; see `Episode` for the fields."""
+
+    id: str
+    kind: Kind
+    task: str
+    seed: int
+    policy_version: int
+    training: str
+
+
+def read_summary(path: Path) -> EpisodeSummary:
+    """Read what an episode is, without decoding its steps; the file is checked as a whole.
+
+    Raises:
+        UserError: as `read_episode`.
+    """
+    contents = _contents(path)
+    try:
+        told = contents.metadata["episode"]
+        summary = EpisodeSummary(
+            id=told["id"],
+            kind=Kind(told["kind"]),
+            task=told["task"],
+            seed=int(told["seed"]),
+            policy_version=int(told["policy_version"]),
+            training=told.get("training", ""),
+        )
+        _check_steps(path, len(contents.messages[STEP]), int(told["steps"]))
+    except (KeyError, ValueError) as error:
+        raise _not_an_episode(path, error) from error
+    return summary
 
 
 def records(path: Path) -> Iterator[McapRecord]:
@@ -240,6 +284,7 @@ def _episode(contents: _Contents) -> Episode:
         else _floats([step.outputs for step in steps], (count, outputs_size)),
         control_period_s=float(told["control_period_s"]),
         states=_states(contents.messages[STATES][:count], json.loads(told.get("states", "null"))),
+        training=told.get("training", ""),  # recordings made before there was this field lack it
     )
 
 
@@ -254,6 +299,7 @@ def _episode_texts(episode: Episode) -> dict[str, str]:
         "backend": episode.backend,
         "policy": episode.policy,
         "policy_version": str(episode.policy_version),
+        "training": episode.training,
         "config_digest": episode.config_digest,
         "control_period_s": repr(episode.control_period_s),
         "steps": str(episode.steps),

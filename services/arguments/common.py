@@ -6,18 +6,26 @@ import argparse
 import logging
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
 from proto.config import Config, load_config
+from proto.errors import UserError
 
 LARGEST_SEED: Final = 2**32 - 1
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     """Add --config and --set."""
-    parser.add_argument("--config", type=Path, help="YAML file; without it, all defaults")
+    parser.add_argument(
+        "--config",
+        type=_config_argument,
+        metavar="FILE|NAME",
+        help="YAML file, or a built-in configuration: experiment1, paper, smoke; without it, all"
+        " defaults",
+    )
     parser.add_argument(
         "--set",
         dest="overrides",
@@ -42,6 +50,30 @@ def add_process(parser: argparse.ArgumentParser) -> None:
     """Add --config, --set, --connect and --id, for a process on the bus."""
     add_connection(parser)
     parser.add_argument("--id", type=_id, help="name of this process on the bus")
+
+
+def config_file(name: str) -> Path:
+    """The file of a configuration: a path, or the name of one that comes with vmdnn.
+
+    Raises:
+        UserError: there is neither a file nor a built-in configuration of this name.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or path.name != name:
+        return path
+    built_in = {file.stem: file for file in Path(str(files("deploy")), "config").glob("*.yaml")}
+    if name not in built_in:
+        raise UserError(
+            f"config file {name} does not exist; built in are: {', '.join(sorted(built_in))}"
+        )
+    return built_in[name]
+
+
+def _config_argument(name: str) -> Path:
+    try:
+        return config_file(name)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def config_of(arguments: argparse.Namespace) -> Config:
@@ -88,20 +120,20 @@ def playing_config(arguments: argparse.Namespace, overrides: Sequence[str] = ())
     return load_config(arguments.config, [*arguments.overrides, *named, *overrides])
 
 
-def seed(text: str) -> int:
-    """A seed, for `type=` of an argument."""
-    return _integer(text, 0, LARGEST_SEED)
+def integer(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Make the `type=` of an argument that is an integer in least..most (None: unlimited)."""
+    limits = f"of at least {least}" if most is None else f"from {least} to {most}"
 
+    def number(text: str) -> int:
+        value = int(text) if re.fullmatch(r"[-+]?[0-9]{1,18}", text) else None
+        if value is None or value < least or (most is not None and value > most):
+            raise argparse.ArgumentTypeError(f"{text!r} is not an integer {limits}")
+        return value
 
-def positive(text: str) -> int:
-    """An integer of at least one, for `type=` of an argument."""
-    return _integer(text, 1, None)
-
-
-def _integer(text: str, least: int, most: int | None) -> int:
-    """Raises argparse.ArgumentTypeError if the text is no integer in least..most."""
-    number = int(text) if re.fullmatch(r"[-+]?[0-9]{1,18}", text) else None
-    if number is None or number < least or (most is not None and number > most):
-        limits = f"of at least {least}" if most is None else f"from {least} to {most}"
-        raise argparse.ArgumentTypeError(f"{text!r} is not an integer {limits}")
     return number
+
+
+seed = integer(0, LARGEST_SEED)
+"""`type=` of an argument that is a seed."""
+positive = integer(1)
+"""`type=` of an argument that is a number of things."""

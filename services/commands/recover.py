@@ -1,4 +1,4 @@
-"""`vmdnn recover`: save what is whole of an MCAP file that was cut off."""
+"""`vmdnn recover`: save the intact part of an MCAP file that was cut off."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
     parser.add_argument("file", type=Path, help="MCAP file, or the .part file that a kill left")
     parser.add_argument(
-        "--out", type=Path, help="where to write what is whole; without it, in place of the file"
+        "--out", type=Path, help="file to write; without it, the file itself is repaired"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Recover, and say how much was kept."""
+    """Recover the file, and say how much of it was intact."""
     found = recover(arguments.file, arguments.out)
     target = arguments.out or arguments.file
     kept = f"{found.messages} messages"

@@ -35,6 +35,7 @@ from services.figures.style import (
     percent,
     words_and_unit,
 )
+from services.terminal.rates import rate_text
 from services.trials.success import Rate
 from services.trials.trial_log import CountedTrial
 
@@ -152,7 +153,10 @@ class Trials:
 
     def approached(self) -> NDArray[np.bool_]:
         """(N,) whether the hand closed while the object was still in its place."""
-        return np.array([self.words.in_place(outcome) for outcome in self.outcomes], dtype=np.bool_)
+        in_place = (
+            bool(outcome.measures) and self.words.in_place(outcome) for outcome in self.outcomes
+        )
+        return np.array(list(in_place), dtype=np.bool_)
 
     def reached(self) -> NDArray[np.bool_]:
         """(N,) whether in addition the hand was about where the object was."""
@@ -162,9 +166,13 @@ class Trials:
         return reached
 
     def error(self, error: GraspError) -> Array:
-        """(N,) an error at the grasp."""
+        """(N,) an error at the grasp; NaN where nothing was measured."""
         pairs = zip(self.outcomes, self.situations, strict=True)
-        return np.array([error.measure(outcome, situation) for outcome, situation in pairs])
+        errors = [
+            error.measure(outcome, situation) if outcome.measures else np.nan
+            for outcome, situation in pairs
+        ]
+        return np.array(errors, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -249,7 +257,7 @@ def table(trials: Trials) -> Table:
             continue
         places = _places(trials, name)
         cells = [
-            _percent(trials.rate(reading, chosen))
+            rate_text(trials.rate(reading, chosen), digits=0)
             for reading in READINGS
             for chosen in places.values()
         ]
@@ -262,7 +270,9 @@ def table(trials: Trials) -> Table:
 def _add_choices(result: Table, trials: Trials, axis: Axis) -> None:
     """Success for each choice of a discrete variable; nothing lies between them."""
     for each in _bins(axis):
-        strict, precise = (_percent(trials.rate(reading, each.chosen)) for reading in READINGS)
+        strict, precise = (
+            rate_text(trials.rate(reading, each.chosen), digits=0) for reading in READINGS
+        )
         result.add_row(f"{words_and_unit(axis.variable.name)[0]} {each.name}", strict, "", precise)
 
 
@@ -434,8 +444,3 @@ def _places(trials: Trials, name: str) -> dict[str, NDArray[np.bool_]]:
 
 def _rate_json(rate: Rate) -> dict[str, Any]:
     return rate.as_json() | {"trials": rate.trials}
-
-
-def _percent(rate: Rate) -> str:
-    low, high = rate.wilson95
-    return f"{100 * rate.rate:.0f} ({100 * low:.0f} to {100 * high:.0f})"

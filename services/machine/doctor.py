@@ -169,7 +169,7 @@ def check_graphics(config: SimulatorConfig) -> Finding:
         diagnosis = load_backend(config.backend).diagnose()
     except UserError as error:
         return Finding(
-            "graphics", str(error), "mend it, or choose another: --set simulator.backend=NAME"
+            "graphics", str(error), "fix it, or choose another: --set simulator.backend=NAME"
         )
     if diagnosis.works:
         return Finding("graphics", diagnosis.found)

@@ -62,12 +62,18 @@ def _actors_table(actors: Sequence[ActorMetrics]) -> Table:
             f"{actor.steps_per_s:.1f}",
             str(actor.episodes),
             "paused" if actor.paused else last,
-            str(actor.outbox),
+            _outbox_words(actor),
             actor.backend,
         )
     if len(actors) > ROWS_SHOWN:
         table.caption = f"and {len(actors) - ROWS_SHOWN} more; all: {actors_words(actors)}"
     return table
+
+
+def _outbox_words(actor: ActorMetrics) -> str:
+    """Such as `2`, or `2, 1 put aside`."""
+    aside = f", {actor.put_aside} put aside" if actor.put_aside else ""
+    return f"{actor.outbox}{aside}"
 
 
 def _scores_table(scores: Sequence[PolicyScore]) -> Table:

@@ -54,6 +54,8 @@ def _learner_words(learner: LearnerMetrics) -> str:
     if learner.loss is not None:
         words.append(f"loss {learner.loss:.4f}")
     words.append(f"{learner.sequences} sequences, {learner.epochs_per_s:.1f} epochs/s")
+    if learner.given_up:
+        words.append(f"{learner.given_up} given up")
     words.append(f"policy {learner.policy_version}")
     return ", ".join(words)
 

@@ -20,15 +20,14 @@ from proto.codec import (
     record_of,
     schema_of,
 )
-from proto.episode import Episode, Id, Outcome
+from proto.episode import SIMULATION_FAILED, Episode, Id, Outcome
 from proto.errors import UserError
-from proto.messages import Count, Rollout
+from proto.messages import Count, EpisodeFailed, Rollout
 from proto.recordings import format1
 from proto.storage import append_line, drop_unfinished_line
 from proto.variables import SituationField
 
 LOG = logging.getLogger(__name__)
-
 
 FORMAT: Final = 2
 """Format of the lines that are written; those of format 1 can be read, too."""
@@ -140,11 +139,25 @@ class TrialLog:
         Raises:
             UserError: it cannot be written; then it is not counted.
         """
-        trial = CountedTrial.of(rollout.episode, rollout.run_id)
-        if trial.seed in self.outcomes(trial.run_id, trial.policy_version):
-            return False
-        append_line(self._path, trial.line())
-        return self._count(trial)
+        return self._add(CountedTrial.of(rollout.episode, rollout.run_id))
+
+    def add_failure(self, report: EpisodeFailed) -> bool:
+        """Count a trial whose simulation failed as a failure; False if it was counted before.
+
+        Raises:
+            UserError: it cannot be written; then it is not counted.
+        """
+        return self._add(
+            CountedTrial(
+                run_id=report.training,
+                policy_version=report.policy_version,
+                seed=report.seed,
+                episode=report.id,
+                actor=report.actor,
+                situation=report.situation,
+                outcome=SIMULATION_FAILED,
+            )
+        )
 
     def versions(self, run_id: str) -> list[int]:
         """Policy versions of a training that were tried, oldest first."""
@@ -154,6 +167,12 @@ class TrialLog:
     def outcomes(self, run_id: str, policy_version: int) -> Mapping[int, Outcome]:
         """Outcomes of a policy version by the trial's seed."""
         return dict(self._outcomes.get((run_id, policy_version), {}))
+
+    def _add(self, trial: CountedTrial) -> bool:
+        if trial.seed in self.outcomes(trial.run_id, trial.policy_version):
+            return False
+        append_line(self._path, trial.line())
+        return self._count(trial)
 
     def _count(self, trial: CountedTrial) -> bool:
         outcomes = self._outcomes[trial.run_id, trial.policy_version]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -19,6 +20,7 @@ from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 from actors.tasks.experiment1.plan import plan
 from actors.tasks.registry import make_task
 from learner.training.trainer import Trainer
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.store import TutoringStore
 from proto.bus import Bus, open_bus
 from proto.config import Config, HubConfig, LearnerConfig, PretrainingConfig, TaskConfig
@@ -29,6 +31,7 @@ from proto.messages import (
     Control,
     ControlReply,
     Correction,
+    EpisodeFailed,
     Live,
     PolicyVersion,
     Receipt,
@@ -40,6 +43,7 @@ from proto.messages import (
     TutoringRequest,
 )
 from proto.metrics import ActorMetrics
+from proto.outbox import IN_FLIGHT
 from proto.seeds import PRACTICE
 
 MakeEpisode = Callable[..., Episode]
@@ -54,7 +58,7 @@ def policy(
     store = TutoringStore(tmp_path_factory.mktemp("tutoring"))
     store.add(make_episode(20, kind=Kind.TUTORING, situation=dict(TASK.tutored()[0])))
     config = Config(learner=LearnerConfig(pretraining=PretrainingConfig(epochs=0)))
-    trainer = Trainer(config, store)
+    trainer = Trainer(VMDNNRecipe(config, TASK.questions), store)
     trainer.epoch()
 
     def make(version: int, run_id: str = "training") -> PolicyVersion:
@@ -63,12 +67,12 @@ def policy(
     return make
 
 
-class Theatre:
+class ActorSetup:
     """A hub, an actor, and a session that acts as learner and evaluator."""
 
     def __init__(self, stack: ExitStack, folder: Path) -> None:
         self._stack = stack
-        self.outbox = folder / "test" / "outbox" / "mime"
+        self.outbox = folder / "test" / "outbox" / "actor-1"
         self.log = folder / "actor.log"
         self.endpoint = free_endpoint()
         self.words = (
@@ -82,12 +86,14 @@ class Theatre:
         self.rollouts: list[Rollout] = []
         self.lives: list[Live] = []
         self.told: ActorMetrics | None = None
+        self.failures: list[EpisodeFailed] = []
         self.gives_receipts = True
+        self.refusal = ""
         self.hub: Popen[bytes]
         self.actor: Popen[bytes]
         self.start_hub()
         self.bus: Bus = stack.enter_context(
-            open_bus(HubConfig(endpoint=self.endpoint), "test", Role.LEARNER, "director")
+            open_bus(HubConfig(endpoint=self.endpoint), "test", Role.LEARNER, "learner")
         )
         self._lock = threading.Lock()
         keys = self.bus.keys
@@ -95,6 +101,7 @@ class Theatre:
         self.bus.answer(keys.request_trial, TrialRequest, lambda _: self._next(self.trials))
         self.bus.subscribe(keys.sequence(), self._on_sequence, Sequence)
         self.bus.subscribe(keys.rollout(), self._on_rollout, Rollout)
+        self.bus.subscribe(keys.failure(), self._on_failure, EpisodeFailed)
         self.bus.subscribe(keys.live(), self.lives.append, Live)
         self.bus.subscribe(keys.metrics(Role.ACTOR), self._on_metrics, ActorMetrics)
 
@@ -103,7 +110,7 @@ class Theatre:
 
     def start_actor(self, *more: str) -> None:
         self.told = None
-        words = (*self.words, "--id", "mime", *more)
+        words = (*self.words, "--id", "actor-1", *more)
         self.actor = self._stack.enter_context(vmdnn("actor", *words, log=self.log))
 
     def publish(self, policy: PolicyVersion) -> None:
@@ -137,30 +144,35 @@ class Theatre:
     def _on_metrics(self, metrics: ActorMetrics) -> None:
         self.told = metrics
 
+    def _on_failure(self, report: EpisodeFailed) -> None:
+        self.failures.append(report)
+        self.bus.deliver(self.bus.keys.receipt(report.actor), Receipt(report.id))
+
     def _acknowledge(self, episode: Episode) -> None:
         if self.gives_receipts:
-            self.bus.deliver(self.bus.keys.receipt(episode.actor), Receipt(episode.id))
+            receipt = Receipt(episode.id, self.refusal)
+            self.bus.deliver(self.bus.keys.receipt(episode.actor), receipt)
 
 
 @pytest.fixture
-def theatre(tmp_path: Path) -> Iterator[Theatre]:
+def setup(tmp_path: Path) -> Iterator[ActorSetup]:
     with ExitStack() as stack:
-        yield Theatre(stack, tmp_path)
+        yield ActorSetup(stack, tmp_path)
 
 
 def test_it_shows_cases_plays_trials_and_practises(
-    theatre: Theatre, policy: Callable[..., PolicyVersion]
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
-    theatre.cases += [
+    setup.cases += [
         TutoringCase("experiment1", 3, 0),
         TutoringCase("experiment1", 99, 0),
         TutoringCase("experiment9", 3, 0),
         TutoringCase("experiment1", 3, 1),
         TutoringCase("reaching", 14, 0),
     ]
-    theatre.start_actor()
-    eventually(lambda: len(theatre.sequences) == 3, "three demonstrations")
-    clean, noisy, reaching = theatre.sequences
+    setup.start_actor()
+    eventually(lambda: len(setup.sequences) == 3, "three demonstrations")
+    clean, noisy, reaching = setup.sequences
     assert (reaching.task, reaching.seed) == ("reaching", 14000)
     assert dict(reaching.situation) == {"object_y_m": 0.30, "object_yaw_deg": 45.0}
     assert "obstacle" not in reaching.body_names
@@ -170,15 +182,15 @@ def test_it_shows_cases_plays_trials_and_practises(
     assert np.array_equal(clean.actions, clean.targets)
     assert not np.array_equal(noisy.actions, noisy.targets)
     assert np.array_equal(noisy.targets, clean.targets)
-    told = theatre.tells(lambda told: told.episodes == 3 and told.outbox == 0)
+    told = setup.tells(lambda told: told.episodes == 3 and told.outbox == 0)
     assert told.policy_version == 0
     assert told.last_kind is Kind.TUTORING
     assert told.last_outcome is reaching.outcome.reason
 
-    theatre.trials.append(Trial(seed=1234))
-    theatre.publish(policy(1))
-    eventually(lambda: len(theatre.rollouts) >= 2, "a trial, then practice")
-    trial, practice = theatre.rollouts[:2]
+    setup.trials.append(Trial(seed=1234))
+    setup.publish(policy(1))
+    eventually(lambda: len(setup.rollouts) >= 2, "a trial, then practice")
+    trial, practice = setup.rollouts[:2]
     assert (trial.run_id, trial.episode.policy_version) == ("training", 1)
     assert (trial.episode.kind, trial.episode.seed) == (Kind.TRIAL, 1234)
     assert dict(trial.episode.situation) == dict(TASK.sample(1234))
@@ -186,115 +198,189 @@ def test_it_shows_cases_plays_trials_and_practises(
     assert practice.episode.kind is Kind.PRACTICE
     assert practice.episode.seed in PRACTICE
 
-    assert theatre.command(Command.PAUSE) == ["paused"]
-    paused = theatre.tells(lambda told: told.paused and told.steps_per_s == 0)
-    theatre.cases.append(TutoringCase("experiment1", 0, 0))
-    assert theatre.tells(lambda t: t.time_s > paused.time_s + 1).episodes == paused.episodes
-    assert theatre.command(Command.RESUME) == ["resumed"]
-    eventually(lambda: len(theatre.sequences) == 4, "it plays again")
-    assert stop(theatre.actor) == 0
+    assert setup.command(Command.PAUSE) == ["paused"]
+    paused = setup.tells(lambda told: told.paused and told.steps_per_s == 0)
+    setup.cases.append(TutoringCase("experiment1", 0, 0))
+    assert setup.tells(lambda t: t.time_s > paused.time_s + 1).episodes == paused.episodes
+    assert setup.command(Command.RESUME) == ["resumed"]
+    eventually(lambda: len(setup.sequences) == 4, "it plays again")
+    assert stop(setup.actor) == 0
 
 
 def test_its_policy_is_guided_where_the_learner_says(
-    theatre: Theatre, policy: Callable[..., PolicyVersion]
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     situation = dict(TASK.sample(3))
     asked = Correction("experiment1", 3, situation)
-    theatre.cases.append(asked)  # has no policy yet
-    theatre.start_actor("--set", "tutor.guidance_deg=2")
-    eventually(lambda: "no policy to be guided" in theatre.log.read_text(), "a warning")
-    assert {(r.run_id, r.policy_version) for r in theatre.requests} == {("", 0)}
+    setup.cases.append(asked)  # has no policy yet
+    setup.start_actor("--set", "tutor.guidance_deg=2")
+    eventually(lambda: "no policy to be guided" in setup.log.read_text(), "a warning")
+    assert {(r.run_id, r.policy_version) for r in setup.requests} == {("", 0)}
 
-    theatre.publish(policy(4))
-    eventually(lambda: TutoringRequest("mime", "training", 4) in theatre.requests, "it holds it")
+    setup.publish(policy(4))
+    eventually(lambda: TutoringRequest("actor-1", "training", 4) in setup.requests, "it holds it")
     outside = {**situation, "object_y_m": 0.9}
-    theatre.cases += [Correction("experiment1", 4, outside), asked]
-    eventually(lambda: len(theatre.sequences) == 1, "a correction")
-    assert "object_y_m = 0.9 lies outside" in theatre.log.read_text()
-    (episode,) = theatre.sequences
+    setup.cases += [Correction("experiment1", 4, outside), asked]
+    eventually(lambda: len(setup.sequences) == 1, "a correction")
+    assert "object_y_m = 0.9 lies outside" in setup.log.read_text()
+    (episode,) = setup.sequences
     assert (episode.kind, episode.policy, episode.policy_version) == (Kind.CORRECTION, "guided", 4)
     assert (episode.seed, dict(episode.situation)) == (3, situation)
+    assert episode.training == "training"
     np.testing.assert_allclose(episode.targets, plan(situation), atol=1e-4)
     off = np.abs(episode.actions - episode.targets)
     assert off.max() <= 2.0 + 1e-4
     assert off.max() > 1.0, "it is the policy that acts"
-    theatre.tells(lambda told: told.outbox == 0)
+    setup.tells(lambda told: told.outbox == 0)
 
 
 def test_a_policy_changes_between_episodes_only(
-    theatre: Theatre, policy: Callable[..., PolicyVersion]
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     def acts_with(version: int) -> bool:
-        return any(live.policy_version == version for live in list(theatre.lives))
+        return any(live.policy_version == version for live in list(setup.lives))
 
-    theatre.publish(policy(1))
-    theatre.start_actor()
+    setup.publish(policy(1))
+    setup.start_actor()
     eventually(lambda: acts_with(1), "it acts with policy 1")
-    theatre.publish(replace(policy(2), weights=b"damaged"))
-    eventually(lambda: "policy 2 is not taken" in theatre.log.read_text(), "a warning")
-    theatre.publish(policy(3))
+    setup.publish(replace(policy(2), weights=b"damaged"))
+    eventually(lambda: "policy 2 cannot be used" in setup.log.read_text(), "a warning")
+    setup.publish(policy(3))
     eventually(lambda: acts_with(3), "it acts with policy 3")
-    theatre.publish(policy(2))  # late: a version never goes back
-    seen_rollouts = len(theatre.rollouts)
-    eventually(lambda: len(theatre.rollouts) >= seen_rollouts + 2, "more episodes")
-    theatre.publish(policy(1, run_id="new"))  # but a new training begins at 1
-    eventually(lambda: any(r.run_id == "new" for r in theatre.rollouts), "the new training")
-    theatre.actor.kill()
+    setup.publish(policy(2))  # late: a version never goes back
+    seen_rollouts = len(setup.rollouts)
+    eventually(lambda: len(setup.rollouts) >= seen_rollouts + 2, "more episodes")
+    setup.publish(policy(1, run_id="new"))  # but a new training begins at 1
+    eventually(lambda: any(r.run_id == "new" for r in setup.rollouts), "the new training")
+    setup.actor.kill()
 
-    seen = [(live.policy_version, live.step) for live in list(theatre.lives)]
+    seen = [(live.policy_version, live.step) for live in list(setup.lives)]
     changes = [after for before, after in pairwise(seen) if before[0] != after[0]]
     assert [version for version, _ in changes] == [3, 1]
     assert {step for _, step in changes} == {0}
-    versions = [(r.run_id, r.episode.policy_version) for r in list(theatre.rollouts)]
+    versions = [(r.run_id, r.episode.policy_version) for r in list(setup.rollouts)]
     assert list(dict.fromkeys(versions)) == [("training", 1), ("training", 3), ("new", 1)]
 
 
-def test_a_killed_actor_sends_again_what_had_no_receipt(theatre: Theatre) -> None:
-    theatre.gives_receipts = False
-    theatre.cases.append(TutoringCase("experiment1", 5, 0))
-    theatre.start_actor()
-    eventually(lambda: len(theatre.sequences) == 1, "a demonstration")
-    theatre.actor.kill()
-    theatre.actor.wait()
-    theatre.gives_receipts = True
-    theatre.start_actor()
-    eventually(lambda: len(theatre.sequences) == 2, "the same once more")
-    first, again = theatre.sequences
+def test_a_killed_actor_sends_again_what_had_no_receipt(setup: ActorSetup) -> None:
+    setup.gives_receipts = False
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.start_actor()
+    eventually(lambda: len(setup.sequences) == 1, "a demonstration")
+    setup.actor.kill()
+    setup.actor.wait()
+    setup.gives_receipts = True
+    setup.start_actor()
+    eventually(lambda: len(setup.sequences) == 2, "the same once more")
+    first, again = setup.sequences
     assert first.id == again.id
     assert np.array_equal(first.actions, again.actions)
-    theatre.tells(lambda told: told.outbox == 0 and told.episodes == 0)
+    setup.tells(lambda told: told.outbox == 0 and told.episodes == 0)
+
+
+def test_of_several_offered_policies_the_newest_is_taken(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.start_actor()
+    eventually(lambda: bool(setup.lives), "a demonstration is going on")
+    setup.publish(policy(3))
+    setup.publish(policy(2))
+    setup.tells(lambda told: told.policy_version > 0)
+    eventually(lambda: len(setup.rollouts) >= 2, "it practises")
+    assert {rollout.episode.policy_version for rollout in setup.rollouts} == {3}
+
+
+def test_what_is_refused_is_put_aside_and_holds_up_nothing(setup: ActorSetup) -> None:
+    setup.refusal = "of another run"
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.start_actor()
+    told = setup.tells(lambda told: told.put_aside == 1)
+    assert (told.outbox, told.failed) == (0, 0)
+    assert [path.suffix for path in setup.outbox.glob("*/*")] == [".refused"]
+    assert "was refused: of another run" in setup.log.read_text()
+    setup.refusal = ""
+    setup.cases.append(TutoringCase("experiment1", 6, 0))
+    setup.tells(lambda told: told.episodes == 2 and told.outbox == 0 and told.put_aside == 1)
+    assert [episode.seed for episode in setup.sequences] == [5000, 6000]
+
+
+def test_messages_of_another_version_hold_up_no_others(setup: ActorSetup) -> None:
+    (setup.outbox / "sequences").mkdir(parents=True)
+    key = setup.bus.keys.sequence("actor-1")
+    header = {"key": key, "encoding": "application/msgpack;vmdnn.sequence.1"}
+    for number in range(IN_FLIGHT + 1):
+        path = setup.outbox / "sequences" / f"{number}-old{number}.message"
+        path.write_bytes(json.dumps(header).encode() + b"\nanything")
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.start_actor()
+    eventually(lambda: len(setup.sequences) == 1, "the new sequence arrives")
+    setup.tells(lambda told: told.episodes == 1 and told.outbox == IN_FLIGHT + 1)
+    assert setup.bus.refused >= IN_FLIGHT
+
+
+def test_a_simulation_that_fails_is_reported_to_who_asked(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    situation = dict(TASK.sample(3))
+    setup.cases += [TutoringCase("experiment1", 5, 0), TutoringCase("experiment1", 6, 1)]
+    setup.start_actor(
+        *("--set", "simulator.backend=tests.failing_simulator:FailingSimulator"),
+        *("--set", "actor.practice=false"),
+    )
+    eventually(lambda: len(setup.failures) == 1, "the second demonstration fails")
+    shown = setup.failures[0]
+    assert (shown.actor, shown.kind, shown.seed) == ("actor-1", Kind.TUTORING, 6001)
+    assert (shown.training, shown.policy_version) == ("", 0)
+    assert dict(shown.situation) == dict(TASK.tutored()[6])
+    assert "NaN" in shown.problem
+
+    setup.publish(policy(4))
+    eventually(lambda: TutoringRequest("actor-1", "training", 4) in setup.requests, "it holds it")
+    setup.cases.append(Correction("experiment1", 3, situation))
+    setup.trials.append(Trial(seed=80))
+    eventually(lambda: len(setup.failures) == 3, "a correction and a trial fail")
+    by_kind = {report.kind: report for report in setup.failures}
+    assert by_kind[Kind.CORRECTION].seed == 3
+    assert by_kind[Kind.TRIAL].seed == 80
+    for kind in (Kind.CORRECTION, Kind.TRIAL):
+        assert (by_kind[kind].training, by_kind[kind].policy_version) == ("training", 4)
+    told = setup.tells(lambda told: told.outbox == 0 and told.failed == 3)
+    assert told.episodes == 1
+    assert [episode.seed for episode in setup.sequences] == [5000]
+    assert setup.actor.poll() is None
 
 
 def test_nothing_is_lost_while_the_hub_is_away(
-    theatre: Theatre, policy: Callable[..., PolicyVersion]
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
-    theatre.publish(policy(1))
-    theatre.start_actor("--set", "actor.live=false")
-    eventually(lambda: len(theatre.rollouts) >= 1, "a rollout")
-    theatre.hub.kill()
-    theatre.hub.wait()
+    setup.publish(policy(1))
+    setup.start_actor("--set", "actor.live=false")
+    eventually(lambda: len(setup.rollouts) >= 1, "a rollout")
+    setup.hub.kill()
+    setup.hub.wait()
     eventually(
-        lambda: len(list(theatre.outbox.glob("*/*.message"))) >= 2, "it plays on without a hub"
+        lambda: len(list(setup.outbox.glob("*/*.message"))) >= 2, "it plays on without a hub"
     )
-    theatre.start_hub()
-    eventually(lambda: theatre.command(Command.PAUSE) == ["paused"], "it is back")
-    told = theatre.tells(lambda told: told.paused and told.outbox == 0)
-    arrived = {rollout.episode.id for rollout in theatre.rollouts}
+    setup.start_hub()
+    eventually(lambda: setup.command(Command.PAUSE) == ["paused"], "it is back")
+    told = setup.tells(lambda told: told.paused and told.outbox == 0)
+    arrived = {rollout.episode.id for rollout in setup.rollouts}
     assert len(arrived) == told.episodes
-    assert list(theatre.outbox.glob("*/*")) == []
-    assert theatre.actor.poll() is None
+    assert list(setup.outbox.glob("*/*")) == []
+    assert setup.actor.poll() is None
 
 
 def test_told_to_stop_it_gives_up_its_episode_and_ends_cleanly(
-    theatre: Theatre, policy: Callable[..., PolicyVersion]
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
-    theatre.publish(policy(1))
+    setup.publish(policy(1))
     # an episode of many hours, were it not for the stop
-    theatre.start_actor("--set", "simulator.physics_period_s=0.00001")
-    eventually(lambda: len(theatre.lives) >= 1, "it plays")
-    assert stop(theatre.actor) == 0
-    assert theatre.rollouts == []
-    assert theatre.bus.present(Role.ACTOR) == set()
+    setup.start_actor("--set", "simulator.physics_period_s=0.00001")
+    eventually(lambda: len(setup.lives) >= 1, "it plays")
+    assert stop(setup.actor) == 0
+    assert setup.rollouts == []
+    assert setup.bus.present(Role.ACTOR) == set()
 
 
 def test_without_a_hub_it_says_what_to_do(tmp_path: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from subprocess import Popen
 
@@ -21,6 +23,7 @@ from learner.checkpoint import (
     training_file,
 )
 from learner.network_policy import NetworkPolicy
+from learner.tutoring.failures import TRIES
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig, TaskConfig
 from proto.episode import Episode, Kind
@@ -30,6 +33,7 @@ from proto.messages import (
     Control,
     ControlReply,
     Correction,
+    EpisodeFailed,
     PolicyVersion,
     Receipt,
     Sequence,
@@ -62,7 +66,7 @@ def case(number: int, repeat: int, task: str = "experiment1") -> TutoringCase:
     return TutoringCase(task, number, repeat)
 
 
-class School:
+class LearnerSetup:
     """A hub, a learner, and a session that acts as an actor."""
 
     def __init__(self, stack: ExitStack, folder: Path, make_episode: MakeEpisode) -> None:
@@ -119,6 +123,7 @@ class School:
             "seed": asked.seed,
             "situation": dict(asked.situation),
             "policy_version": self.policies[-1].version,
+            "training": self.policies[-1].run_id,
             **fields,
         }
         return self._make_episode(20, kind=Kind.CORRECTION, actor="actor", **given)
@@ -150,19 +155,30 @@ class School:
         }
         return self._make_episode(20, kind=Kind.TUTORING, actor="actor", **given)
 
-    def send(self, episode: Episode) -> None:
-        """Send a sequence until its receipt comes."""
+    def send(self, episode: Episode) -> str:
+        """Send a sequence until it is answered; gives the refusal, empty if there is none."""
+        return self._send(episode.id, self.actor.keys.sequence("actor"), Sequence(episode))
+
+    def fail(self, report: EpisodeFailed) -> str:
+        """The same with the report that a simulation failed."""
+        return self._send(report.id, self.actor.keys.failure("actor"), report)
+
+    def _send(self, name: str, key: str, message: object) -> str:
         self._receipts.clear()
 
-        def received() -> bool:
-            self.actor.deliver(self.actor.keys.sequence("actor"), Sequence(episode))
-            return Receipt(episode.id) in self._receipts
+        def answers() -> list[Receipt]:
+            return [receipt for receipt in list(self._receipts) if receipt.episode == name]
 
-        eventually(received, "a receipt")
+        def answered() -> bool:
+            self.actor.deliver(key, message)
+            return bool(answers())
+
+        eventually(answered, "an answer")
+        return answers()[0].refusal
 
     def show_all(self) -> None:
         for number in SETTINGS["learner.cases"]:  # type: ignore[attr-defined]
-            self.send(self.episode(case(number, 0)))
+            assert self.send(self.episode(case(number, 0))) == ""
 
     def tells(self, what: Callable[[LearnerMetrics], bool]) -> LearnerMetrics:
         eventually(lambda: self.told is not None and what(self.told), "the metrics it should tell")
@@ -174,53 +190,57 @@ class School:
 
 
 @pytest.fixture
-def school(tmp_path: Path, make_episode: MakeEpisode) -> Iterator[School]:
+def setup(tmp_path: Path, make_episode: MakeEpisode) -> Iterator[LearnerSetup]:
     with ExitStack() as stack:
-        yield School(stack, tmp_path, make_episode)
+        yield LearnerSetup(stack, tmp_path, make_episode)
 
 
-def test_it_asks_for_each_case_once_and_keeps_what_it_is_shown(school: School) -> None:
-    school.start()
-    given = [school.ask_until_given(), *school.ask(), *school.ask(), *school.ask()]
+def test_it_asks_for_each_case_once_and_keeps_what_it_is_shown(setup: LearnerSetup) -> None:
+    setup.start()
+    given = [setup.ask_until_given(), *setup.ask(), *setup.ask(), *setup.ask()]
     assert given == [case(number, 0) for number in (0, 20, 44)]
-    told = school.tells(lambda told: told.stage is Stage.WAITING)
+    told = setup.tells(lambda told: told.stage is Stage.WAITING)
     assert (told.sequences, told.loss, told.policy_version) == (0, None, 0)
 
-    school.send(school.episode(given[0]))
-    school.send(school.episode(given[0]))
-    school.send(school.episode(given[0], id="the-same-case-shown-by-another"))
-    school.send(school.episode(case(7, 0), id="a-case-nobody-asked-for"))
-    school.send(school.episode(given[1], task="experiment9", id="another-task"))
-    school.tells(lambda told: told.sequences == 1)
-    kept = list((school.folder / "tutoring").iterdir())
+    episode = setup.episode(given[0])
+    assert setup.send(episode) == setup.send(episode) == ""
+    assert setup.send(setup.episode(given[0], id="the-same-case-of-another-actor")) == ""
+    nobodys = setup.send(setup.episode(case(7, 0), id="a-case-nobody-asked-for"))
+    assert nobodys == "no tutored case of experiment1 with the seed 7000 is asked for"
+    other_task = setup.send(setup.episode(given[1], task="experiment9", id="another-task"))
+    assert other_task == "this run learns experiment1, not experiment9"
+    practice = setup.send(replace(episode, kind=Kind.PRACTICE, id="no-demonstration"))
+    assert practice == "nothing is learned from an episode of the kind practice"
+    setup.tells(lambda told: told.sequences == 1)
+    kept = list((setup.folder / "tutoring").iterdir())
     assert [path.name for path in kept] == ["case0.mcap"]
-    sent = school.episode(given[0])
+    sent = setup.episode(given[0])
     assert np.array_equal(read_episode(kept[0]).images, sent.images)
 
     # what was shown is not asked for again, what the actor took with it is
-    school.process.kill()
-    school.process.wait()
-    school.start()
-    assert school.ask_until_given() == case(20, 0)
-    assert stop(school.process) == 0
+    setup.process.kill()
+    setup.process.wait()
+    setup.start()
+    assert setup.ask_until_given() == case(20, 0)
+    assert stop(setup.process) == 0
 
 
 def test_pretraining_has_cases_of_its_own_and_does_not_wait_for_the_others(
-    school: School,
+    setup: LearnerSetup,
 ) -> None:
     asked = {"task": "reaching", "cases": "[0,14]", "repeats": 1, "epochs": 3}
     words = [f"--set=learner.pretraining.{name}={value}" for name, value in asked.items()]
-    school.start(*words, "--set", "learner.publish_every_epochs=400")
+    setup.start(*words, "--set", "learner.publish_every_epochs=400")
     first, second = case(0, 0, "reaching"), case(14, 0, "reaching")
-    assert [school.ask_until_given(), *school.ask(), *school.ask()] == [first, second, case(0, 0)]
-    school.send(school.episode(case(0, 0)))
-    school.send(school.episode(first, id="reaching0"))
-    assert school.tells(lambda told: told.sequences == 2).stage is Stage.WAITING
+    assert [setup.ask_until_given(), *setup.ask(), *setup.ask()] == [first, second, case(0, 0)]
+    setup.send(setup.episode(case(0, 0)))
+    setup.send(setup.episode(first, id="reaching0"))
+    assert setup.tells(lambda told: told.sequences == 2).stage is Stage.WAITING
 
-    school.send(school.episode(second, id="reaching14"))
-    formed = pretraining_file(school.folder)
+    setup.send(setup.episode(second, id="reaching14"))
+    formed = pretraining_file(setup.folder)
     eventually(formed.exists, "pre-training is over")
-    told = school.tells(lambda told: told.stage is Stage.WAITING and told.epoch == 3)
+    told = setup.tells(lambda told: told.stage is Stage.WAITING and told.epoch == 3)
     assert (told.epochs_total, told.sequences) == (3, 3)
     checkpoint = load_checkpoint(formed)
     assert checkpoint.metadata.stage is Stage.PRETRAINING
@@ -231,25 +251,25 @@ def test_pretraining_has_cases_of_its_own_and_does_not_wait_for_the_others(
     assert checkpoint.part("classifier.")["weight"].shape == (3 + 5, 20)
 
     # it goes on with the others once they are there, also after a restart
-    school.process.kill()
-    school.process.wait()
-    school.start(*words, "--set", "learner.publish_every_epochs=400")
-    school.show_all()
-    school.tells(lambda told: told.stage is Stage.FINISHED)
-    assert stop(school.process) == 0
-    kept = {path.stem for path in (school.folder / "pretraining").iterdir()}
+    setup.process.kill()
+    setup.process.wait()
+    setup.start(*words, "--set", "learner.publish_every_epochs=400")
+    setup.show_all()
+    setup.tells(lambda told: told.stage is Stage.FINISHED)
+    assert stop(setup.process) == 0
+    kept = {path.stem for path in (setup.folder / "pretraining").iterdir()}
     assert kept == {"reaching0", "reaching14"}
-    tutored = {path.stem for path in (school.folder / "tutoring").iterdir()}
+    tutored = {path.stem for path in (setup.folder / "tutoring").iterdir()}
     assert tutored == {"case0", "case20", "case44"}
 
 
-def test_a_killed_learner_publishes_its_policy_again_and_goes_on(school: School) -> None:
-    school.start()
-    school.show_all()
-    eventually(lambda: len(school.policies) >= 3, "three policies")
-    school.process.kill()
-    school.process.wait()
-    before = list(school.policies)
+def test_a_killed_learner_publishes_its_policy_again_and_goes_on(setup: LearnerSetup) -> None:
+    setup.start()
+    setup.show_all()
+    eventually(lambda: len(setup.policies) >= 3, "three policies")
+    setup.process.kill()
+    setup.process.wait()
+    before = list(setup.policies)
     assert [policy.version for policy in before] == list(range(1, len(before) + 1))
     assert [policy.epoch for policy in before] == [5 * policy.version for policy in before]
     policy = NetworkPolicy.from_bytes(before[-1].weights)
@@ -257,110 +277,147 @@ def test_a_killed_learner_publishes_its_policy_again_and_goes_on(school: School)
     assert policy.step(np.zeros((48, 64), np.uint8)).shape == (11,)
 
     # it may have saved one more than anyone heard of before it was killed
-    known = load_checkpoint(training_file(school.folder)).metadata.version
+    known = load_checkpoint(training_file(setup.folder)).metadata.version
     assert known in {before[-1].version, before[-1].version + 1}
 
-    school.policies.clear()
-    school.start()
-    eventually(lambda: len(school.policies) >= 3, "policies after the restart")
-    again = school.policies[0]
+    setup.policies.clear()
+    setup.start()
+    eventually(lambda: len(setup.policies) >= 3, "policies after the restart")
+    again = setup.policies[0]
     assert again.version == known
     if known == before[-1].version:
         assert again == before[-1]
-    assert {policy.run_id for policy in school.policies} == {before[0].run_id}
-    versions = [policy.version for policy in school.policies]
+    assert {policy.run_id for policy in setup.policies} == {before[0].run_id}
+    versions = [policy.version for policy in setup.policies]
     assert versions == list(range(again.version, again.version + len(versions)))
-    assert [policy.epoch for policy in school.policies] == [5 * version for version in versions]
-    assert school.ask() == [], "everything was shown before"
-    school.tells(lambda told: told.done and told.sequences == 3)
+    assert [policy.epoch for policy in setup.policies] == [5 * version for version in versions]
+    assert setup.ask() == [], "everything was shown before"
+    setup.tells(lambda told: told.done and told.sequences == 3)
 
 
-def test_its_policy_is_corrected_where_it_fails_and_it_learns_on(school: School) -> None:
+def test_its_policy_is_corrected_where_it_fails_and_it_learns_on(setup: LearnerSetup) -> None:
     corrections = {"rounds": 1, "sequences": 3, "tries": 5, "epochs": 4}
     words = [f"--set=learner.corrections.{name}={value}" for name, value in corrections.items()]
     words += ["--set", "learner.epochs=6", "--set", "done.policy_versions=3"]
-    school.start(*words)
-    school.show_all()
-    told = school.tells(lambda told: told.stage is Stage.WAITING and told.round == 1)
+    setup.start(*words)
+    setup.show_all()
+    told = setup.tells(lambda told: told.stage is Stage.WAITING and told.round == 1)
     assert (told.epoch, told.epochs_total, told.policy_version) == (6, 10, 2)
     assert (told.corrections, told.corrections_total, told.done) == (0, 3, False)
-    eventually(
-        lambda: [p.epoch for p in school.policies] == [5, 6], "the policies of the first lap"
-    )
-    assert school.ask() == [], "it knows of no failure"
+    eventually(lambda: [p.epoch for p in setup.policies] == [5, 6], "the policies of the first lap")
+    assert setup.ask() == [], "it knows of no failure"
 
-    first, second = school.practise_in_vain(2**30), school.practise_in_vain(2**30 + 1)
+    first, second = setup.practise_in_vain(2**30), setup.practise_in_vain(2**30 + 1)
     task = make_task(TaskConfig())
     assert first == Correction("experiment1", 2**30, task.sample(2**30))
-    school.send(school.correction(first))
-    school.send(school.correction(first, id="the-same-once-more"))
-    school.send(school.correction(first, id="of-another-policy", policy_version=1))
-    school.tells(lambda told: told.corrections == 1)
+    setup.send(setup.correction(first))
+    setup.send(setup.correction(first, id="the-same-once-more"))
+    setup.send(setup.correction(first, id="of-another-policy", policy_version=1))
+    foreign = setup.correction(second, id="of-another-training", training="before")
+    assert "a policy of another training" in setup.send(foreign)
+    setup.tells(lambda told: told.corrections == 1)
 
     # what was asked for and shown before is not forgotten
-    school.process.kill()
-    school.process.wait()
-    school.policies.clear()
-    school.start(*words)
-    told = school.tells(lambda told: told.stage is Stage.WAITING)
+    setup.process.kill()
+    setup.process.wait()
+    setup.policies.clear()
+    setup.start(*words)
+    told = setup.tells(lambda told: told.stage is Stage.WAITING)
     assert (told.corrections, told.sequences) == (1, 4)
-    eventually(lambda: [p.version for p in school.policies] == [2], "the newest policy again")
-    school.send(school.correction(second))
-    school.send(school.correction(school.practise_in_vain(2**30 + 2)))
+    eventually(lambda: [p.version for p in setup.policies] == [2], "the newest policy again")
+    setup.send(setup.correction(second))
+    setup.send(setup.correction(setup.practise_in_vain(2**30 + 2)))
 
-    told = school.tells(lambda told: told.stage is Stage.FINISHED)
+    told = setup.tells(lambda told: told.stage is Stage.FINISHED)
     assert (told.epoch, told.sequences, told.policy_version, told.done) == (10, 6, 3, True)
-    eventually(lambda: school.policies[-1].version == 3, "a policy of the round")
-    metadata = checkpoint_from_bytes(school.policies[-1].weights, "").metadata
+    eventually(lambda: setup.policies[-1].version == 3, "a policy of the round")
+    metadata = checkpoint_from_bytes(setup.policies[-1].weights, "").metadata
     assert (metadata.epoch, metadata.cases, metadata.sequences) == (10, 6, 6)
-    assert school.ask() == []
-    assert stop(school.process) == 0
+    assert setup.ask() == []
+    assert stop(setup.process) == 0
 
 
-def test_it_obeys_and_a_clean_stop_loses_no_epoch(school: School) -> None:
-    school.start("--set", "learner.epochs=1000000", "--set", "learner.publish_every_epochs=1000")
-    school.show_all()
-    school.tells(lambda told: told.stage is Stage.COUPLED and told.epoch > 0)
+def test_what_cannot_be_simulated_is_given_up_and_not_waited_for(
+    setup: LearnerSetup, failure: Callable[..., EpisodeFailed]
+) -> None:
+    setup.start()
+    assert setup.ask_until_given() == case(0, 0)
+    assert setup.ask() == [case(20, 0)]
+    for attempt in range(TRIES):
+        assert setup.ask() == [case(44, 0)], "it is handed out again, without waiting for the lease"
+        report = failure(f"report{attempt}", seed=case(44, 0).seed)
+        assert setup.fail(report) == setup.fail(report) == ""
+    assert setup.ask() == []
+    setup.send(setup.episode(case(0, 0)))
+    assert setup.tells(lambda told: told.sequences == 1).stage is Stage.WAITING
+    setup.send(setup.episode(case(20, 0)))
+    told = setup.tells(lambda told: told.stage is not Stage.WAITING)
+    assert (told.given_up, told.sequences) == (1, 2)
+
+
+def test_corrections_of_an_earlier_training_do_not_count(setup: LearnerSetup) -> None:
+    corrections = {"rounds": 1, "sequences": 1, "tries": 5, "epochs": 1000000}
+    words = [f"--set=learner.corrections.{name}={value}" for name, value in corrections.items()]
+    words += ["--set", "learner.epochs=5"]
+    setup.start(*words)
+    setup.show_all()
+    setup.tells(lambda told: told.stage is Stage.WAITING and told.round == 1)
+    eventually(lambda: bool(setup.policies), "the policy")
+    setup.send(setup.correction(setup.practise_in_vain(2**30)))
+    setup.tells(lambda told: told.stage is Stage.COUPLED and told.round == 1)
+    setup.process.kill()
+    setup.process.wait()
+    shutil.rmtree(setup.folder / "checkpoints")
+    setup.policies.clear()
+    setup.start(*words)
+    told = setup.tells(lambda told: told.stage is Stage.WAITING and told.round == 1)
+    assert (told.policy_version, told.corrections, told.sequences) == (1, 0, 4)
+
+
+def test_it_obeys_and_a_clean_stop_loses_no_epoch(setup: LearnerSetup) -> None:
+    setup.start("--set", "learner.epochs=1000000", "--set", "learner.publish_every_epochs=1000")
+    setup.show_all()
+    setup.tells(lambda told: told.stage is Stage.COUPLED and told.epoch > 0)
 
     def tell(command: Command) -> str:
-        control = school.actor.keys.control(Role.LEARNER)
-        replies = school.actor.ask(control, Control(command), ControlReply, timeout_s=20.0)
+        control = setup.actor.keys.control(Role.LEARNER)
+        replies = setup.actor.ask(control, Control(command), ControlReply, timeout_s=20.0)
         return " ".join(reply.note for reply in replies)
 
     assert tell(Command.PAUSE) == "paused"
-    paused = school.tells(lambda told: told.paused and told.epochs_per_s == 0)
-    assert school.tells(lambda told: told.time_s > paused.time_s).epoch == paused.epoch
-    checkpoint = school.folder / "checkpoints" / "training.safetensors"
+    paused = setup.tells(lambda told: told.paused and told.epochs_per_s == 0)
+    assert setup.tells(lambda told: told.time_s > paused.time_s).epoch == paused.epoch
+    checkpoint = setup.folder / "checkpoints" / "training.safetensors"
     assert tell(Command.CHECKPOINT) == f"saved coupled epoch {paused.epoch} to {checkpoint}"
     tell(Command.RESUME)
-    school.tells(lambda told: told.epoch > paused.epoch)
-    assert stop(school.process) == 0
-    last = school.told
+    setup.tells(lambda told: told.epoch > paused.epoch)
+    assert stop(setup.process) == 0
+    last = setup.told
     assert last is not None
     assert load_checkpoint(checkpoint).metadata.epoch >= last.epoch
 
 
 def test_the_last_epoch_gives_a_policy_that_another_network_does_not_overwrite(
-    school: School,
+    setup: LearnerSetup,
 ) -> None:
-    school.start("--set", "learner.epochs=8")
-    school.show_all()
-    told = school.tells(lambda told: told.stage is Stage.FINISHED)
-    eventually(lambda: [p.epoch for p in school.policies] == [5, 8], "two policies")
+    setup.start("--set", "learner.epochs=8")
+    setup.show_all()
+    told = setup.tells(lambda told: told.stage is Stage.FINISHED)
+    eventually(lambda: [p.epoch for p in setup.policies] == [5, 8], "two policies")
     assert (told.epoch, told.epochs_total, told.policy_version) == (8, 8, 2)
     assert not told.done, "the configuration asks for three versions"
-    assert stop(school.process) == 0
+    assert stop(setup.process) == 0
 
-    checkpoint = school.folder / "checkpoints" / "training.safetensors"
+    checkpoint = setup.folder / "checkpoints" / "training.safetensors"
     before = checkpoint.read_bytes()
-    ended = run_vmdnn("learner", *school.words, "--set", "network.pfc.units=7")
+    ended = run_vmdnn("learner", *setup.words, "--set", "network.pfc.units=7")
     assert ended.returncode == 2
     assert "network.pfc" in ended.stderr
     assert "Traceback" not in ended.stderr
     assert checkpoint.read_bytes() == before
 
 
-def test_a_wrong_case_is_said_before_anything_starts(school: School) -> None:
-    ended = run_vmdnn("learner", *school.words, "--set", "learner.cases=[45]")
+def test_a_wrong_case_is_said_before_anything_starts(setup: LearnerSetup) -> None:
+    ended = run_vmdnn("learner", *setup.words, "--set", "learner.cases=[45]")
     assert ended.returncode == 2
     assert "learner.cases: there is no case 45" in ended.stderr

@@ -138,7 +138,7 @@ def test_a_bad_message_is_counted_logged_once_and_harms_nothing(
     logged = [record.message for record in caplog.records if "refused" in record.message]
     assert len(logged) == 2
     assert sum("learner/honest" in line for line in logged) == 1
-    assert all("encoding: expected application/msgpack;vmdnn.receipt.1" in line for line in logged)
+    assert all("encoding: expected application/msgpack;vmdnn.receipt.2" in line for line in logged)
 
 
 def test_a_payload_that_changed_on_its_way_is_refused(shared: Network) -> None:

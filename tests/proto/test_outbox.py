@@ -107,6 +107,7 @@ def test_a_new_process_finds_what_the_old_one_left_in_order(tmp_path: Path, link
     (tmp_path / "1-episode-d.message.0123abcd.part").write_bytes(b"{")  # killed while writing
     new = Outbox(tmp_path, link)
     assert len(new) == 2
+    assert suffixes(tmp_path) == [".message", ".message"]
     new.send_due()
     assert link.take() == ["a", "c"]
     new.received("episode-a")
@@ -117,6 +118,7 @@ def test_the_oldest_go_first_and_not_all_at_once(outbox: Outbox, link: Link) -> 
     names = fill(outbox, "m", IN_FLIGHT + 3)
     assert link.take() == names[:IN_FLIGHT]
     outbox.received(names[0])
+    outbox.send_due()
     assert link.take() == [names[IN_FLIGHT]], "an answer makes room for the next"
 
 
@@ -133,6 +135,7 @@ def test_messages_that_nobody_answers_hold_up_no_others(
     assert sent[2:] == unanswered[: IN_FLIGHT - 2], "the window is full, and no fuller"
     for name in good:
         outbox.received(name)
+    outbox.send_due()
     link.take()
     for _ in range(100):  # from then on they are rarely sent, and a new one goes at once
         clock.now_s += 1.0
@@ -157,6 +160,7 @@ def test_when_the_receiver_is_back_everything_is_sent_soon(
     link.take()
     clock.now_s += AFTER_S
     outbox.received(names[1])
+    outbox.send_due()
     assert link.take() == [names[0], names[2]]
 
 
@@ -168,6 +172,7 @@ def test_what_is_refused_is_put_aside_and_never_sent_again(
     link.take()
     for name in refused:
         outbox.refused(name, "of another task")
+    outbox.send_due()
     assert link.take() == good
     assert (len(outbox), outbox.put_aside) == (1, IN_FLIGHT)
     outbox.refused(refused[0], "of another task")

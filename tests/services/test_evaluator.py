@@ -20,6 +20,7 @@ from proto.messages import (
     Command,
     Control,
     ControlReply,
+    EpisodeFailed,
     PolicyVersion,
     Receipt,
     Rollout,
@@ -32,7 +33,7 @@ from proto.metrics import EvaluatorMetrics
 MakeEpisode = Callable[..., Episode]
 
 
-class Field:
+class EvaluatorSetup:
     """A hub, an evaluator, and sessions that act as learner and actors."""
 
     def __init__(self, stack: ExitStack, folder: Path, make_episode: MakeEpisode) -> None:
@@ -93,136 +94,180 @@ class Field:
 
     def send(self, actor: Bus, seed: int, version: int, **fields: object) -> Episode:
         """Send a rollout until its receipt comes."""
+        episode = self._episode(actor, seed, version, **fields)
+        rollout = Rollout(episode, "training")
+        assert self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout) == ""
+        return episode
+
+    def refused(self, actor: Bus, seed: int, version: int, **fields: object) -> str:
+        """Send a rollout until it is refused; gives the reason."""
+        episode = self._episode(actor, seed, version, **fields)
+        rollout = Rollout(episode, "training")
+        return self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout)
+
+    def fail(self, actor: Bus, report: EpisodeFailed) -> str:
+        """Report a failed simulation until it is answered; gives the refusal, or nothing."""
+        return self._answer(actor, report.id, actor.keys.failure(actor.id), report)
+
+    def _episode(self, actor: Bus, seed: int, version: int, **fields: object) -> Episode:
         given = {"kind": Kind.TRIAL, "outcome": PRECISE, "id": f"{seed}-{version}", **fields}
-        episode = self._make_episode(3, actor=actor.id, seed=seed, policy_version=version, **given)
+        return self._make_episode(3, actor=actor.id, seed=seed, policy_version=version, **given)
+
+    def _answer(self, actor: Bus, name: str, key: str, message: object) -> str:
         receipts: list[Receipt] = []
         actor.subscribe(actor.keys.receipt(actor.id), receipts.append, Receipt)
 
-        def received() -> bool:
-            actor.deliver(actor.keys.rollout(actor.id), Rollout(episode, "training"))
-            return Receipt(episode.id) in receipts
+        def answers() -> list[Receipt]:
+            return [receipt for receipt in list(receipts) if receipt.episode == name]
 
-        eventually(received, "a receipt")
-        return episode
+        def answered() -> bool:
+            actor.deliver(key, message)
+            return bool(answers())
+
+        eventually(answered, "an answer")
+        return answers()[0].refusal
 
     def _listen(self, metrics: EvaluatorMetrics) -> None:
         self.told = metrics
 
 
 @pytest.fixture
-def field(tmp_path: Path, make_episode: MakeEpisode) -> Iterator[Field]:
+def setup(tmp_path: Path, make_episode: MakeEpisode) -> Iterator[EvaluatorSetup]:
     with ExitStack() as stack:
-        yield Field(stack, tmp_path, make_episode)
+        yield EvaluatorSetup(stack, tmp_path, make_episode)
 
 
 def counts(metrics: EvaluatorMetrics) -> dict[int, int]:
     return {score.version: score.trials for score in metrics.policies}
 
 
-def test_every_policy_gets_the_same_situations_each_counted_once(field: Field) -> None:
-    actor, other = field.join(Role.ACTOR, "a"), field.join(Role.ACTOR, "b")
-    field.publish(1)
-    seeds = [field.ask_until_given(actor, 1), *field.ask(other, 1), *field.ask(actor, 1)]
+def test_every_policy_gets_the_same_situations_each_counted_once(setup: EvaluatorSetup) -> None:
+    actor, other = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "b")
+    setup.publish(1)
+    seeds = [setup.ask_until_given(actor, 1), *setup.ask(other, 1), *setup.ask(actor, 1)]
     assert seeds == [70, 71, 72]
-    assert field.ask(other, 1) == [], "all three are being played"
-    field.tells(lambda told: told.leases == 3)
+    assert setup.ask(other, 1) == [], "all three are being played"
+    setup.tells(lambda told: told.leases == 3)
 
-    field.send(actor, 70, 1)
-    field.send(actor, 70, 1)
-    field.send(other, 70, 1, id="another-episode-of-this-trial", outcome=NOT_LIFTED)
-    field.send(other, 71, 1, outcome=NOT_LIFTED)
-    field.send(other, 99, 1)  # nobody asked for it
-    field.send(actor, 5, 1, kind=Kind.PRACTICE)
-    told = field.tells(lambda told: counts(told) == {1: 2})
+    setup.send(actor, 70, 1)
+    setup.send(actor, 70, 1)
+    setup.send(other, 70, 1, id="another-episode-of-this-trial", outcome=NOT_LIFTED)
+    setup.send(other, 71, 1, outcome=NOT_LIFTED)
+    assert setup.refused(other, 99, 1) == "no trial with the seed 99 is asked for"
+    setup.send(actor, 5, 1, kind=Kind.PRACTICE)
+    told = setup.tells(lambda told: counts(told) == {1: 2})
     score = told.policies[0]
     assert (score.precise.successes, score.precise.rate) == (1, 0.5)
     assert score.precise.wilson95 == pytest.approx((0.0945, 0.9055), abs=1e-3)
     assert score.reasons == {"not_lifted": 1}
     assert not told.done
 
-    field.publish(2)
-    assert field.ask_until_given(actor, 2) == 70
-    assert field.ask(actor, 1) == [], "only the newest policy is tried"
-    field.send(actor, 72, 1)  # was under way when the newer policy came
+    setup.publish(2)
+    assert setup.ask_until_given(actor, 2) == 70
+    assert setup.ask(actor, 1) == [], "only the newest policy is tried"
+    setup.send(actor, 72, 1)  # was under way when the newer policy came
     for seed in (70, 71, 72):
-        field.send(actor, seed, 2)
-    told = field.tells(lambda told: counts(told) == {1: 3, 2: 3})
+        setup.send(actor, seed, 2)
+    told = setup.tells(lambda told: counts(told) == {1: 3, 2: 3})
     assert told.done
     assert told.leases == 0
-    assert field.ask(actor, 2) == [], "the newest policy is counted in full"
+    assert setup.ask(actor, 2) == [], "the newest policy is counted in full"
 
 
 def test_the_learner_hears_of_practice_but_never_of_the_situations_of_trials(
-    field: Field,
+    setup: EvaluatorSetup,
 ) -> None:
-    actor = field.join(Role.ACTOR, "a")
-    field.publish(1)
-    field.ask_until_given(actor, 1)
-    field.send(actor, 70, 1, outcome=NOT_LIFTED)
-    field.send(actor, 70, 1, id="not-even-if-practised", kind=Kind.PRACTICE, outcome=NOT_LIFTED)
-    field.send(actor, 99, 1, id="a-trial-that-nobody-asked-for")
-    field.send(actor, 98, 1, id="another-task", kind=Kind.PRACTICE, task="reaching")
-    practised = field.send(actor, 2**30, 1, kind=Kind.PRACTICE, outcome=NOT_LIFTED)
-    eventually(lambda: bool(field.verdicts), "a verdict")
-    assert set(field.verdicts_by_seed()) == {2**30}
-    told = field.verdicts_by_seed()[2**30]
+    actor = setup.join(Role.ACTOR, "a")
+    setup.publish(1)
+    setup.ask_until_given(actor, 1)
+    setup.send(actor, 70, 1, outcome=NOT_LIFTED)
+    practice = {"kind": Kind.PRACTICE, "outcome": NOT_LIFTED}
+    assert "one of trials" in setup.refused(actor, 70, 1, id="practised", **practice)
+    other_task = setup.refused(actor, 98, 1, id="another-task", task="reaching", **practice)
+    assert other_task == "this run tests experiment1, not reaching"
+    shown = setup.refused(actor, 97, 1, id="shown", kind=Kind.TUTORING)
+    assert shown == "an episode of the kind tutoring is not evaluated"
+    practised = setup.send(actor, 2**30, 1, kind=Kind.PRACTICE, outcome=NOT_LIFTED)
+    eventually(lambda: bool(setup.verdicts), "a verdict")
+    assert set(setup.verdicts_by_seed()) == {2**30}
+    told = setup.verdicts_by_seed()[2**30]
     assert (told.run_id, told.policy_version, told.task) == ("training", 1, "experiment1")
     assert (told.outcome, dict(told.situation)) == (NOT_LIFTED, dict(practised.situation))
 
 
-def test_a_killed_evaluator_carries_on_with_what_it_counted(field: Field) -> None:
-    actor = field.join(Role.ACTOR, "a")
-    field.publish(1)
-    assert field.ask_until_given(actor, 1) == 70
-    field.send(actor, 70, 1)
-    field.process.kill()
-    field.process.wait()
-    field.start()
-    field.send(actor, 70, 1)  # its receipt might have been lost
-    assert field.ask_until_given(actor, 1) == 71
-    assert counts(field.tells(lambda told: bool(told.policies))) == {1: 1}
-    assert stop(field.process) == 0
+def test_a_killed_evaluator_carries_on_with_what_it_counted(setup: EvaluatorSetup) -> None:
+    actor = setup.join(Role.ACTOR, "a")
+    setup.publish(1)
+    assert setup.ask_until_given(actor, 1) == 70
+    setup.send(actor, 70, 1)
+    setup.process.kill()
+    setup.process.wait()
+    setup.start()
+    setup.send(actor, 70, 1)  # its receipt might have been lost
+    assert setup.ask_until_given(actor, 1) == 71
+    assert counts(setup.tells(lambda told: bool(told.policies))) == {1: 1}
+    assert stop(setup.process) == 0
 
 
-def test_a_trial_of_an_actor_that_died_is_given_to_another(field: Field) -> None:
-    mortal, other = field.join(Role.ACTOR, "mortal"), field.join(Role.ACTOR, "other")
+def test_a_trial_whose_simulation_fails_is_a_failure_and_is_not_played_again(
+    setup: EvaluatorSetup, failure: Callable[..., EpisodeFailed]
+) -> None:
+    actor = setup.join(Role.ACTOR, "a")
+    setup.publish(1)
+    assert setup.ask_until_given(actor, 1) == 70
+    trial = {"actor": "a", "kind": Kind.TRIAL, "training": "training", "policy_version": 1}
+    assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
+    assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
+    assert "seed 99" in setup.fail(actor, failure("nobody-asked", seed=99, **trial))
+    told = setup.tells(lambda told: counts(told) == {1: 1})
+    assert told.policies[0].reasons == {"simulation_failed": 1}
+    assert told.policies[0].lenient.successes == 0
+    assert setup.ask(actor, 1) == [71]
+    setup.process.kill()
+    setup.process.wait()
+    setup.start()
+    assert setup.ask_until_given(actor, 1) == 71
+
+
+def test_a_trial_of_an_actor_that_died_is_given_to_another(setup: EvaluatorSetup) -> None:
+    mortal, other = setup.join(Role.ACTOR, "mortal"), setup.join(Role.ACTOR, "other")
     mortal.announce()
-    field.publish(1)
-    assert field.ask_until_given(mortal, 1) == 70
-    assert field.ask(other, 1) == [71]
+    setup.publish(1)
+    assert setup.ask_until_given(mortal, 1) == 70
+    assert setup.ask(other, 1) == [71]
     mortal.close()
-    eventually(lambda: field.ask(other, 1) == [70], "the dead actor's trial")
+    eventually(lambda: setup.ask(other, 1) == [70], "the dead actor's trial")
 
 
-def test_a_new_training_is_counted_anew(field: Field) -> None:
-    actor = field.join(Role.ACTOR, "a")
-    field.publish(5)
-    assert field.ask_until_given(actor, 5) == 70
-    field.send(actor, 70, 5)
-    field.tells(lambda told: counts(told) == {5: 1})
-    field.publish(1, run_id="started-from-nothing")
-    field.tells(lambda told: counts(told) == {})
-    assert field.ask(actor, 1, run_id="started-from-nothing") == [70]
+def test_a_new_training_is_counted_anew(setup: EvaluatorSetup) -> None:
+    actor = setup.join(Role.ACTOR, "a")
+    setup.publish(5)
+    assert setup.ask_until_given(actor, 5) == 70
+    setup.send(actor, 70, 5)
+    setup.tells(lambda told: counts(told) == {5: 1})
+    setup.publish(1, run_id="started-from-nothing")
+    setup.tells(lambda told: counts(told) == {})
+    assert setup.ask(actor, 1, run_id="started-from-nothing") == [70]
 
 
-def test_a_pause_stops_the_handing_out_but_not_the_counting(field: Field) -> None:
-    actor = field.join(Role.ACTOR, "a")
-    field.publish(1)
-    field.ask_until_given(actor, 1)
+def test_a_pause_stops_the_handing_out_but_not_the_counting(setup: EvaluatorSetup) -> None:
+    actor = setup.join(Role.ACTOR, "a")
+    setup.publish(1)
+    setup.ask_until_given(actor, 1)
     control = actor.keys.control(Role.EVALUATOR)
     assert [r.note for r in actor.ask(control, Control(Command.PAUSE), ControlReply)] == ["paused"]
-    assert field.ask(actor, 1) == []
-    field.send(actor, 70, 1)
-    field.tells(lambda told: told.paused and counts(told) == {1: 1})
+    assert setup.ask(actor, 1) == []
+    setup.send(actor, 70, 1)
+    setup.tells(lambda told: told.paused and counts(told) == {1: 1})
     actor.ask(control, Control(Command.RESUME), ControlReply)
-    assert field.ask(actor, 1) == [71]
+    assert setup.ask(actor, 1) == [71]
     actor.ask(control, Control(Command.STOP), ControlReply)
-    assert field.process.wait(30) == 0
+    assert setup.process.wait(30) == 0
 
 
-def test_a_second_evaluator_of_the_same_folder_is_refused(field: Field) -> None:
-    field.tells(lambda _: True)
-    second = run_vmdnn("evaluator", *field.words, "--id", "second")
+def test_a_second_evaluator_of_the_same_folder_is_refused(setup: EvaluatorSetup) -> None:
+    setup.tells(lambda _: True)
+    second = run_vmdnn("evaluator", *setup.words, "--id", "second")
     assert second.returncode == 2
     assert "already works in" in second.stderr
 

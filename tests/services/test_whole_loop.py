@@ -141,7 +141,7 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
                 score.version: score.trials for score in evaluator.policies
             }
 
-        eventually(tells_what_it_counted, "the metrics agree with the evaluator's book")
+        eventually(tells_what_it_counted, "the metrics agree with the trial log")
         assert loop.stop_all() == [0] * 6
 
     for folder, task, cases in (

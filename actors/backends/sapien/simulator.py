@@ -17,7 +17,7 @@ from actors.backends.robot import (
     motors_of,
 )
 from actors.backends.sapien import graphics
-from actors.backends.sapien.stage import Stage
+from actors.backends.sapien.renderer import Renderer
 from actors.backends.sapien.world import RobotBuilder, World
 from actors.simulator import (
     Array,
@@ -39,26 +39,28 @@ from sim_assets.icub_visuals import Visual
 class SapienSimulator:
     """Plays scenes in SAPIEN; see `actors.simulator.Simulator`.
 
-    With `config.render` false nothing graphical is touched and every observed image is black.
-
-    Raises:
-        UserError: pictures are wanted, but this machine cannot render; or the robot's model cannot
-            be built. The message says what to do.
+    With `config.render` false no graphics driver is loaded and every observed image is black.
     """
 
     name = "sapien"
 
     def __init__(self, config: SimulatorConfig) -> None:
+        """Make the simulator.
+
+        Raises:
+            UserError: pictures are wanted, but this machine cannot render; or the robot's model
+                cannot be built. The message says what to do.
+        """
         self.control_period_s = config.control_period_s
         if config.render:
             graphics.require_graphics()
         self._config = config
         self._model = build_robot()
         self._builder = RobotBuilder(self._model)
-        self._eye_stage: Stage | None = None
-        self._outside_stage: Stage | None = None
+        self._eye_renderer: Renderer | None = None
+        self._outside_renderer: Renderer | None = None
         self._scene: Scene | None = None
-        self._world_now: World | None = None
+        self._current_world: World | None = None
         self._targets_deg = np.zeros(MOTOR_COUNT)
         self._step = 0
         # Measured once a step at most: players ask before and after each step.
@@ -71,11 +73,11 @@ class SapienSimulator:
         return graphics.diagnose()
 
     def reset(self, scene: Scene) -> None:
-        """Replace whatever was there with `scene`; the same scene gives the same episode."""
+        """Replace the previous scene by `scene`; the same scene gives the same episode."""
         self._scene = scene
         self._step = 0
         self._targets_deg = motors_of(scene.start)
-        self._world_now = World(
+        self._current_world = World(
             self._builder,
             self._model.joints,
             scene,
@@ -83,9 +85,9 @@ class SapienSimulator:
             self._config.physics_period_s,
         )
         self._forget()
-        for stage in (self._eye_stage, self._outside_stage):
-            if stage is not None:
-                stage.set_scene(scene)
+        for renderer in (self._eye_renderer, self._outside_renderer):
+            if renderer is not None:
+                renderer.set_scene(scene)
 
     def step(self, targets: JointTargets) -> StepReport:
         """Run one control period, moving the motors' targets linearly to `targets`.
@@ -146,11 +148,11 @@ class SapienSimulator:
 
     def outside_picture(self, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the scene from outside, full meshes."""
-        if self._outside_stage is None:
-            self._outside_stage = self._make_stage(self._model.seen_from_outside)
-        self._outside_stage.place(self._world.poses(), self._step)
+        if self._outside_renderer is None:
+            self._outside_renderer = self._make_renderer(self._model.seen_from_outside)
+        self._outside_renderer.place(self._world.poses(), self._step)
         factor = eye.OUTSIDE_SUPERSAMPLING
-        fine = self._outside_stage.picture(
+        fine = self._outside_renderer.picture(
             sapien.Pose(eye.outside_pose()),
             factor * width,
             factor * height,
@@ -160,13 +162,13 @@ class SapienSimulator:
 
     def close(self) -> None:
         """Free what the simulator holds."""
-        self._world_now = self._eye_stage = self._outside_stage = None
+        self._current_world = self._eye_renderer = self._outside_renderer = None
 
     @property
     def _world(self) -> World:
-        if self._world_now is None:
-            raise RuntimeError("reset(scene) must come before everything else")
-        return self._world_now
+        if self._current_world is None:
+            raise RuntimeError("call reset(scene) first")
+        return self._current_world
 
     def _forget(self) -> None:
         """Discard what was measured: the robot or a box may have moved."""
@@ -174,15 +176,15 @@ class SapienSimulator:
 
     def _look(self, crop: Crop, width: int, height: int) -> Image:
         """Rendered picture (height, width, 4) of the left eye's crop; see `actors.backends.eye`."""
-        if self._eye_stage is None:
-            self._eye_stage = self._make_stage(self._model.seen_by_eye)
+        if self._eye_renderer is None:
+            self._eye_renderer = self._make_renderer(self._model.seen_by_eye)
         poses = self._world.poses()
-        self._eye_stage.place(poses, self._step)
+        self._eye_renderer.place(poses, self._step)
         focal = eye.eye_focal_lengths(crop, width, height)
-        return self._eye_stage.picture(poses[EYE], width, height, focal)
+        return self._eye_renderer.picture(poses[EYE], width, height, focal)
 
-    def _make_stage(self, robot: tuple[Visual, ...]) -> Stage:
-        stage = Stage(robot)
+    def _make_renderer(self, robot: tuple[Visual, ...]) -> Renderer:
+        renderer = Renderer(robot)
         if self._scene is not None:
-            stage.set_scene(self._scene)
-        return stage
+            renderer.set_scene(self._scene)
+        return renderer

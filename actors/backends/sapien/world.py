@@ -25,7 +25,7 @@ _ROBOT_GROUPS: Final = [1, 1, 1, 0]
 
 
 class RobotBuilder:
-    """Builds the articulation again and again, reading the URDF once."""
+    """Builds the robot for each scene, but reads the URDF only once."""
 
     def __init__(self, model: IcubModel) -> None:
         loader = URDFLoader()
@@ -44,7 +44,7 @@ class RobotBuilder:
         self._builder.set_initial_pose(sapien.Pose([0.0, 0.0, height_m], robot.ROOT_QUATERNION))
         articulation = self._builder.build(fix_root_link=True)
         for link in articulation.links:
-            link.disable_gravity = True  # as if the arm's controller compensated for it
+            link.disable_gravity = True  # as if the robot's controller compensated for it
         for name in self._joints:
             _set_drive(articulation.find_joint_by_name(name), robot.drive_of(name))
         return articulation
@@ -101,8 +101,9 @@ class World:
         self._robot = builder.build(self._scene, scene.table_drop_m)
         order = [joint.name for joint in self._robot.active_joints]
         self._drives = [self._robot.find_joint_by_name(name) for name in joints]
-        self._from_ours = np.array([joints.index(name) for name in order])
-        self._to_ours = np.array([order.index(name) for name in joints])
+        # Position of each of PhysX's joints among the model's, and the other way round.
+        self._model_rows = np.array([joints.index(name) for name in order])
+        self._physx_rows = np.array([order.index(name) for name in joints])
         self._links = {link.name: link for link in self._robot.links}
         self._bodies = {box.name: _add_box(self._scene, box) for box in scene.boxes}
         moving = {box.name for box in scene.boxes if box.mass_kg is not None}
@@ -114,7 +115,7 @@ class World:
         self.drive(start_rad)
 
     def drive(self, targets_rad: Array) -> None:
-        """Give every joint (J,) its target."""
+        """Set the target angles (J,) of all joints."""
         for joint, target in zip(self._drives, targets_rad.tolist(), strict=True):
             joint.set_drive_target(target)
 
@@ -132,11 +133,11 @@ class World:
 
     def joints_rad(self) -> Array:
         """Measured joint angles (J,)."""
-        return np.asarray(self._robot.qpos[self._to_ours], dtype=np.float64)
+        return np.asarray(self._robot.qpos[self._physx_rows], dtype=np.float64)
 
     def put(self, joints_rad: Array, boxes: Mapping[str, Pose]) -> None:
-        """Place the robot, at rest, and boxes."""
-        self._robot.set_qpos(joints_rad[self._from_ours])
+        """Put the robot, at rest, and some of the boxes where they are told to be."""
+        self._robot.set_qpos(joints_rad[self._model_rows])
         self._robot.set_qvel(np.zeros(len(joints_rad)))
         for name, pose in boxes.items():
             self._bodies[name].entity.set_pose(sapien.Pose(pose.position_m, pose.quaternion))

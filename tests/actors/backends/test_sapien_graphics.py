@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from actors.backends import light
-from actors.backends.sapien import graphics, stage
+from actors.backends.sapien import graphics, renderer
 from actors.backends.sapien.probe import known_devices
 from actors.backends.sapien.simulator import SapienSimulator
 from actors.simulator import make_simulator
@@ -139,10 +139,24 @@ def test_without_rendering_no_graphics_driver_is_needed():
 
 
 def test_the_shader_has_the_shared_light():
-    text = (Path(stage.__file__).parent / "shader" / "gbuffer.frag").read_text()
+    text = (Path(renderer.__file__).parent / "shader" / "gbuffer.frag").read_text()
     towards = re.search(r"const vec3 TO_SUN = vec3\((.*)\);", text)
     numbers = dict(re.findall(r"const float (\w+) = (.*);", text))
     assert tuple(map(float, towards[1].split(","))) == light.TO_SUN
     assert {name: float(number) for name, number in numbers.items()} == {
         "SUN": light.SUN, "SKY": light.SKY, "GROUND": light.GROUND, "GAMMA": light.GAMMA,
     }  # fmt: skip
+
+
+def test_nothing_else_names_its_driver():
+    root = Path(renderer.__file__).parents[3]
+    packages = ("proto", "sim_assets", "learner", "actors", "services", "deploy")
+    naming = [
+        str(file.relative_to(root))
+        for package in packages
+        for pattern in ("*.py", "*.sh", "*.yaml")
+        for file in (root / package).rglob(pattern)
+        if re.search(r"vulkan|\bmesa\b|LP_NUM_THREADS", file.read_text(), re.IGNORECASE)
+    ]
+    assert naming
+    assert all(name.startswith("actors/backends/sapien/") for name in naming), naming

@@ -11,9 +11,10 @@ from outcomes import IMPRECISE, PRECISE
 
 from actors.tasks.registry import make_task
 from learner.tutoring.corrections import Round
+from learner.tutoring.failures import TRIES
 from proto.config import Config, TaskConfig
 from proto.episode import Episode, Kind, Outcome
-from proto.messages import Correction, TutoringRequest, Verdict
+from proto.messages import Correction, EpisodeFailed, TutoringRequest, Verdict
 from proto.seeds import CORRECTIONS
 
 MakeEpisode = Callable[..., Episode]
@@ -46,7 +47,13 @@ def verdict(seed: int, outcome: Outcome = IMPRECISE, **given: Any) -> Verdict:
 @pytest.fixture
 def correction(make_episode: MakeEpisode) -> Callable[..., Episode]:
     def make(seed: int, **given: Any) -> Episode:
-        values = {"kind": Kind.CORRECTION, "policy_version": 7, "task": "experiment1", **given}
+        values = {
+            "kind": Kind.CORRECTION,
+            "policy_version": 7,
+            "training": "training",
+            "task": "experiment1",
+            **given,
+        }
         return make_episode(5, seed=seed, **values)
 
     return make
@@ -61,7 +68,7 @@ def test_what_failed_in_practice_is_corrected(correction: Callable[..., Episode]
     assert ask_all(round_) == [Correction("experiment1", 2, TASK.sample(2))]
     assert (round_.judged, round_.kept, round_.most) == (2, 0, 2)
 
-    round_.shown(correction(2))
+    round_.keep(correction(2))
     round_.judge(verdict(2))
     assert ask(round_) is None
     assert not round_.complete, "there may be more failures"
@@ -69,7 +76,7 @@ def test_what_failed_in_practice_is_corrected(correction: Callable[..., Episode]
     round_.judge(verdict(4))
     assert [asked.seed for asked in ask_all(round_)] == [3], "two are enough"
     assert not round_.complete
-    round_.shown(correction(3))
+    round_.keep(correction(3))
     assert round_.complete
     assert round_.kept == 2
 
@@ -85,7 +92,7 @@ def test_a_good_policy_is_not_searched_for_failures_for_ever(
     assert not round_.complete, "the one failure is still to be corrected"
     round_.judge(verdict(9))
     assert [asked.seed for asked in ask_all(round_)] == [0]
-    round_.shown(correction(0))
+    round_.keep(correction(0))
     assert round_.complete
 
 
@@ -147,17 +154,49 @@ def test_only_corrections_of_this_round_are_wanted_and_each_once(
         {"kind": Kind.TUTORING},
         {"kind": Kind.PRACTICE},
         {"policy_version": 6},
+        {"training": "an earlier one"},
+        {"training": ""},
         {"task": "reaching"},
         {"seed": 1},
     ):
         other = replace(ours, **foreign)  # type: ignore[arg-type]
         assert not round_.wants(other)
-        round_.shown(other)
+        round_.keep(other)
     assert round_.kept == 0
     assert round_.wants(ours)
-    round_.shown(ours)
+    round_.keep(ours)
     assert not round_.wants(ours)
     assert round_.complete
+
+
+def test_a_correction_whose_simulation_fails_again_and_again_is_given_up(
+    correction: Callable[..., Episode], failure: Callable[..., EpisodeFailed]
+) -> None:
+    round_ = make_round(choose="tutored", sequences=2)
+    policy = {"kind": Kind.CORRECTION, "training": "training", "policy_version": 7}
+    assert not round_.fail(failure("other-policy", **policy | {"policy_version": 6}))
+    for attempt in range(TRIES):
+        asked = ask(round_)
+        assert asked is not None
+        assert asked.seed == 0
+        assert round_.fail(failure(f"{attempt}", **policy)) == (attempt == TRIES - 1)
+    assert [asked.seed for asked in ask_all(round_)] == [1]
+    assert not round_.complete
+    round_.keep(correction(1))
+    assert round_.complete
+    assert (round_.kept, round_.most) == (1, 2)
+
+
+def test_what_fails_again_and_again_is_not_looked_for_again(
+    failure: Callable[..., EpisodeFailed],
+) -> None:
+    round_ = make_round()
+    round_.judge(verdict(2))
+    policy = {"kind": Kind.CORRECTION, "training": "training", "policy_version": 7, "seed": 2}
+    for attempt in range(TRIES):
+        round_.fail(failure(f"{attempt}", **policy))
+    round_.judge(verdict(2))
+    assert ask(round_) is None
 
 
 def test_what_was_asked_for_before_a_restart_is_welcome(
@@ -165,9 +204,9 @@ def test_what_was_asked_for_before_a_restart_is_welcome(
 ) -> None:
     round_ = make_round()  # knows of no failure any more
     assert round_.wants(correction(77))
-    round_.shown(correction(77))
+    round_.keep(correction(77))
     assert not round_.wants(correction(77))
     round_.judge(verdict(78))
     assert not round_.wants(correction(79)), "two are enough"
-    round_.shown(correction(78))
+    round_.keep(correction(78))
     assert round_.complete

@@ -8,10 +8,11 @@ from typing import Any
 import pytest
 
 from learner.tutoring.curriculum import Curriculum
+from learner.tutoring.failures import TRIES
 from proto.config import Config, LearnerConfig, PretrainingConfig, TutorConfig
 from proto.episode import Episode, Kind
 from proto.errors import UserError
-from proto.messages import TutoringCase
+from proto.messages import EpisodeFailed, TutoringCase
 
 MakeEpisode = Callable[..., Episode]
 
@@ -33,7 +34,7 @@ def curriculum(cases: tuple[int, ...] | None = (0, 7), repeats: int = 2) -> Curr
 
 def test_clean_executions_come_first() -> None:
     plan = curriculum()
-    assert plan.sizes == {"experiment1": 4}
+    assert plan.size("experiment1") == 4
     assert [plan.next_case("a") for _ in range(5)] == [
         case(0, 0),
         case(7, 0),
@@ -44,7 +45,7 @@ def test_clean_executions_come_first() -> None:
 
 
 def test_all_cases_unless_some_are_named() -> None:
-    assert curriculum(cases=None, repeats=4).sizes == {"experiment1": 180}
+    assert curriculum(cases=None, repeats=4).size("experiment1") == 180
 
 
 def test_cases_of_pretraining_come_before_all_others(make_episode: MakeEpisode) -> None:
@@ -53,14 +54,14 @@ def test_cases_of_pretraining_come_before_all_others(make_episode: MakeEpisode) 
         learner=LearnerConfig(cases=(0,), pretraining=first), tutor=TutorConfig(repeats=1)
     )
     plan = Curriculum(config, AVAILABLE)
-    assert plan.sizes == {"reaching": 4, "experiment1": 1}
+    assert (plan.size("reaching"), plan.size("experiment1")) == (4, 1)
     assert [plan.next_case("a") for _ in range(6)] == [
         *(case(number, repeat, "reaching") for repeat in (0, 1) for number in (0, 14)),
         case(0, 0),
         None,
     ]
     # the same case of the other task has the same seed, and is another one
-    plan.shown([make_episode(kind=Kind.TUTORING, task="reaching", seed=0)])
+    plan.keep(make_episode(kind=Kind.TUTORING, task="reaching", seed=0))
     assert plan.wants(make_episode(kind=Kind.TUTORING, task="experiment1", seed=0))
     assert not plan.wants(make_episode(kind=Kind.TUTORING, task="reaching", seed=0))
     assert plan.missing == 4
@@ -69,14 +70,15 @@ def test_cases_of_pretraining_come_before_all_others(make_episode: MakeEpisode) 
 @pytest.mark.parametrize("without", [{"epochs": 0}, {"task": None}])
 def test_pretraining_without_sequences_of_its_own(without: dict[str, Any]) -> None:
     config = Config(learner=LearnerConfig(pretraining=PretrainingConfig(**without)))
-    assert Curriculum(config, AVAILABLE).sizes == {"experiment1": 180}
+    assert Curriculum(config, AVAILABLE).size("experiment1") == 180
 
 
 def test_what_was_shown_is_not_handed_out_again(make_episode: MakeEpisode) -> None:
     plan = curriculum()
     shown = make_episode(kind=Kind.TUTORING, seed=case(7, 1).seed)
     assert plan.wants(shown)
-    plan.shown([shown, shown])
+    plan.keep(shown)
+    plan.keep(shown)
     assert not plan.wants(shown)
     assert plan.missing == 3
     assert case(7, 1) not in [plan.next_case("a") for _ in range(4)]
@@ -96,6 +98,33 @@ def test_only_the_tasks_own_tutored_cases_are_wanted(make_episode: MakeEpisode) 
     assert not plan.wants(make_episode(kind=Kind.TUTORING, seed=0, task="experiment9"))
     assert not plan.wants(make_episode(kind=Kind.TUTORING, seed=1000))
     assert plan.wants(make_episode(kind=Kind.TUTORING, seed=0))
+
+
+def test_an_episode_of_no_planned_case_is_refused(make_episode: MakeEpisode) -> None:
+    plan = curriculum()
+    assert plan.refusal(make_episode(kind=Kind.TUTORING, seed=7001)) == ""
+    plan.keep(make_episode(kind=Kind.TUTORING, seed=7001))
+    assert plan.refusal(make_episode(kind=Kind.TUTORING, seed=7001)) == "", "a second one is none"
+    assert "with the seed 7002 is asked" in plan.refusal(
+        make_episode(kind=Kind.TUTORING, seed=7002)
+    )
+
+
+def test_a_case_whose_simulation_fails_again_and_again_is_given_up(
+    failure: Callable[..., EpisodeFailed],
+) -> None:
+    plan = curriculum(cases=(0,), repeats=2)
+    for attempt in range(TRIES):
+        assert plan.next_case("a") == case(0, 0)
+        report = failure(f"report{attempt}", seed=0)
+        given_up = plan.fail(report)
+        assert given_up == (attempt == TRIES - 1)
+        if not given_up:
+            assert not plan.fail(report), "a report that is sent again counts once"
+    assert plan.next_case("a") == case(0, 1)
+    assert (plan.missing, plan.size("experiment1")) == (1, 1)
+    assert not plan.fail(failure("late", seed=0))
+    assert not plan.fail(failure("of-no-case", seed=5))
 
 
 def test_a_case_that_there_is_not_is_named() -> None:

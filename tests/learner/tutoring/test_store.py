@@ -24,6 +24,8 @@ def test_sequences_are_there_again_after_a_restart(
     assert loaded is not None
     np.testing.assert_array_equal(loaded.images, episodes[2].images)
     np.testing.assert_array_equal(loaded.targets, episodes[2].targets)
+    known = [(summary.id, summary.seed, summary.kind) for summary in again.summaries()]
+    assert known == sorted((episode.id, episode.seed, episode.kind) for episode in episodes)
 
 
 def test_the_same_sequence_is_kept_once(tmp_path: Path, bar_episodes: MakeEpisodes) -> None:
@@ -51,6 +53,10 @@ def test_damaged_file_is_reported_and_may_be_replaced(
     assert list(again.damaged) == [bad.id]
     assert "vmdnn recover" in caplog.text
     assert path.exists()
+
+    summaries = TutoringStore(tmp_path)
+    assert [summary.id for summary in summaries.summaries()] == [good.id]
+    assert list(summaries.damaged) == [bad.id]
 
     assert again.add(bad)
     assert again.load(bad.id) is not None

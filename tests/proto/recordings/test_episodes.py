@@ -20,7 +20,7 @@ from mcap.writer import Writer
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
 from proto.episode import NO_FAILURE, Episode, Kind, Measure, Outcome
 from proto.errors import UserError
-from proto.recordings.episodes import read_episode, write_episode
+from proto.recordings.episodes import EpisodeSummary, read_episode, read_summary, write_episode
 from sim_assets.hand import MOTOR_NAMES
 
 OUTPUTS = 110
@@ -74,6 +74,7 @@ def episodes(draw: st.DrawFn) -> Episode:
         outputs=draw(st.none() | floats(steps, OUTPUTS)),
         control_period_s=draw(st.floats(0.001, 10.0)),
         states=draw(st.none() | st.dictionaries(word, floats(steps, 7), max_size=3)),
+        training=draw(word),
     )
 
 
@@ -100,6 +101,9 @@ def test_every_field_comes_back_exactly(
     again = read_episode(path)
     for item in fields(Episode):
         assert same(getattr(again, item.name), getattr(episode, item.name)), item.name
+    summary = read_summary(path)
+    for item in fields(EpisodeSummary):
+        assert getattr(summary, item.name) == getattr(episode, item.name)
 
 
 def test_an_episode_without_states_is_recorded_as_before_there_were_any(
@@ -188,6 +192,9 @@ def test_a_flipped_byte_is_refused_or_harmless(
         return
     for item in fields(Episode):
         assert same(getattr(again, item.name), getattr(episode, item.name)), item.name
+    summary = read_summary(path)
+    for item in fields(EpisodeSummary):
+        assert getattr(summary, item.name) == getattr(episode, item.name)
 
 
 def test_what_is_no_recording_is_named(tmp_path: Path) -> None:

@@ -71,3 +71,10 @@ def test_what_the_learner_is_at(given: dict[str, Any], said: str) -> None:
 def test_a_view_of_nothing_can_be_shown() -> None:
     assert run_line(view_of()) == "0 actors, 0 steps/s, 0 episodes"
     assert RUN in shown(view_of())
+
+
+def test_what_went_wrong_is_shown() -> None:
+    view = view_of(replace(ACTOR, put_aside=3), replace(LEARNER, given_up=2))
+    assert "2, 3 put aside" in shown(view)
+    assert "2 given up" in run_line(view)
+    assert "put aside" not in shown(view_of(ACTOR))

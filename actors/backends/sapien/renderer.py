@@ -1,8 +1,8 @@
-"""Pictures of the world: a copy of its bodies that is moved to where they are when needed.
+"""Draws the world with SAPIEN: a copy of its bodies, moved to their poses before each picture.
 
-Rendering is kept apart from the physics, so that a machine without any graphics driver can still
-run scenes, and the same world can be drawn in two ways: quickly for the robot's eye, and with all
-details from outside.
+Rendering is separate from the physics for two reasons. A machine without a graphics driver can
+still run scenes. And the same world can be drawn in two ways: quickly for the robot's eye, and in
+full detail from outside.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SHADER: Final = Path(__file__).parent / "shader"
 
 @dataclass
 class _ShownScreen:
-    """A screen on the stage.
+    """A screen in the rendered scene.
 
     Attributes:
         screen: what it shows.
@@ -46,8 +46,8 @@ class _ShownScreen:
             self.step = step
 
 
-class Stage:
-    """Bodies made of shapes under a light that never changes (see `shader/`)."""
+class Renderer:
+    """The robot in one set of meshes, boxes and screen, in the light of `actors.backends.light`."""
 
     def __init__(self, robot: Iterable[Visual]) -> None:
         render.set_picture_format("Color", "r8g8b8a8unorm")  # a quarter of the usual floats
@@ -62,7 +62,7 @@ class Stage:
         self._cameras: dict[tuple[int, int], Any] = {}
 
     def set_scene(self, scene: Scene) -> None:
-        """Replace boxes and screen by those of another scene."""
+        """Replace all boxes and the screen."""
         for entity in self._boxes.values():
             self._scene.remove_entity(entity)
         if self._screen is not None:

@@ -1,0 +1,49 @@
+"""Sequences that cannot be recorded because their simulation fails again and again."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from typing import Final, Generic, Protocol, TypeVar
+
+from proto.episode import Kind
+
+TRIES: Final = 3
+"""After so many failed simulations a sequence is not asked for any more."""
+
+Item = TypeVar("Item", bound=Hashable)
+
+
+class Shown(Protocol):
+    """What tells one sequence from another: an episode, its summary, or a report that it failed.
+
+    The attributes are those of `Episode`.
+    """
+
+    @property
+    def kind(self) -> Kind: ...  # noqa: D102
+    @property
+    def task(self) -> str: ...  # noqa: D102
+    @property
+    def seed(self) -> int: ...  # noqa: D102
+    @property
+    def policy_version(self) -> int: ...  # noqa: D102
+    @property
+    def training(self) -> str: ...  # noqa: D102
+
+
+class Failures(Generic[Item]):
+    """Counts how often the simulation of each item failed."""
+
+    def __init__(self) -> None:
+        self._reports: dict[Item, set[str]] = {}
+
+    def add(self, item: Item, report: str) -> bool:
+        """Count a failure of an item; whether the item has had all its TRIES.
+
+        Args:
+            item: what failed.
+            report: id of the report; the same report counts once.
+        """
+        reports = self._reports.setdefault(item, set())
+        reports.add(report)
+        return len(reports) >= TRIES
