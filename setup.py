@@ -2,26 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
+import sys
 from pathlib import Path
-from types import ModuleType
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-
-def _load_builder() -> ModuleType:
-    """learner.kernels.build, which needs nothing but Python; the package is not installed yet."""
-    path = Path(__file__).parent / "learner" / "kernels" / "build.py"
-    spec = importlib.util.spec_from_file_location("build_kernel", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-builder = _load_builder()
+# The package is not installed yet. What is imported here needs nothing but Python.
+sys.path.insert(0, str(Path(__file__).parent))
+from learner.kernels import build as builder
 
 
 class CompileKernel(build_ext):

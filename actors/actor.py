@@ -12,12 +12,14 @@ from typing import Final
 import numpy as np
 
 from actors.player import LiveStep, play
-from actors.policies.by_name import make_tutor
+from actors.policies.by_name import check_task
 from actors.policies.contract import Policy
 from actors.policies.guided import GuidedPolicy
+from actors.policies.planned import make_tutor
 from actors.simulator import make_simulator
-from actors.tasks.contract import Situation, Task
-from actors.tasks.registry import TASKS, make_task
+from actors.tasks.contract import Task
+from actors.tasks.registry import make_task
+from learner.checkpoint import checkpoint_from_bytes
 from learner.network_policy import NetworkPolicy
 from proto.bus import Bus
 from proto.codec import MessageError, encode
@@ -44,6 +46,7 @@ from proto.outbox import Outbox
 from proto.pace import Pace
 from proto.periodic import every
 from proto.seeds import PRACTICE
+from proto.variables import Situation
 
 LOG = logging.getLogger(__name__)
 
@@ -119,7 +122,9 @@ class Actor:
         self._lifecycle = lifecycle
         self._digest = config.digest()
         self._task = make_task(config.task)
-        self._tasks = {name: make(config.task.attention) for name, make in TASKS.items()}
+        self._tasks = {self._task.name: self._task}
+        if (first := config.pretraining_task) is not None:
+            self._tasks[first] = make_task(config.task_called(first))
         self._simulator = make_simulator(config.simulator)
         outbox = config.run_folder / "outbox" / bus.id
         self._sequences = Outbox(outbox / "sequences", bus.deliver_wire)
@@ -228,7 +233,7 @@ class Actor:
         situations = task.tutored()
         if asked.case >= len(situations):
             raise UserError(f"{asked.task} has no tutored case {asked.case}")
-        tutor = make_tutor(self._config, noisy=asked.repeat > 0)
+        tutor = make_tutor(task, self._config.tutor if asked.repeat > 0 else None)
         return Assignment(Kind.TUTORING, task, tutor, situations[asked.case], asked.seed)
 
     def _guidance(self, asked: Correction) -> Assignment:
@@ -241,7 +246,7 @@ class Actor:
         task.check(asked.situation)
         if self._policy is None:
             raise UserError("there is no policy to be guided")
-        tutor = make_tutor(self._config, noisy=False)
+        tutor = make_tutor(task)
         guided = GuidedPolicy(self._policy, tutor, self._config.tutor.guidance_deg)
         return Assignment(
             Kind.CORRECTION, task, guided, asked.situation, asked.seed, self._policy_run
@@ -249,7 +254,7 @@ class Actor:
 
     def _task_called(self, name: str) -> Task:
         if name not in self._tasks:
-            raise UserError(f"no task is called {name!r}")
+            raise UserError(f"this actor plays {' and '.join(self._tasks)}, not the task {name!r}")
         return self._tasks[name]
 
     def _trial(self) -> Assignment | None:
@@ -369,7 +374,9 @@ class Actor:
         if offered is None or not _is_newer(offered, self._policy_run, held):
             return
         try:
-            self._policy = NetworkPolicy.from_bytes(offered.weights)
+            checkpoint = checkpoint_from_bytes(offered.weights, "the policy")
+            check_task(checkpoint, self._task.name, "the policy")
+            self._policy = NetworkPolicy(checkpoint, "the policy")
         except UserError as error:
             LOG.warning("policy %d cannot be used: %s", offered.version, error)
             return

@@ -1,4 +1,4 @@
-"""Attention (paper, section 3.2): what the levels in an action mean for eye and motors."""
+"""What the values of an action mean for the eye and the motors (paper, section 3.2)."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ _MAXIMUM: Final = np.array([value.maximum for value in ACTION_VALUES])
 
 
 def crop_of_focus(level: float) -> Crop:
-    """The part of the eye image that a focus level (1 wide .. 20 fovea) shows the network."""
-    z = float(np.clip(level, _MINIMUM[FOCUS], _MAXIMUM[FOCUS]))
-    return Crop(round(EYE_WIDTH - 8 * (z - 1)), round(EYE_HEIGHT - 6 * (z - 1)))
+    """The crop of the eye image that the network sees at a focus level, 1 (wide) to 20 (fovea)."""
+    clipped = float(np.clip(level, _MINIMUM[FOCUS], _MAXIMUM[FOCUS]))
+    return Crop(round(EYE_WIDTH - 8 * (clipped - 1)), round(EYE_HEIGHT - 6 * (clipped - 1)))
 
 
 def clip_action(action: Array) -> Array:
-    """Actions (..., 11) within the robot's limits."""
+    """Clip actions (..., 11) to the robot's limits."""
     return np.asarray(action.clip(_MINIMUM, _MAXIMUM))
 
 
-def attention_of(start: Array, action: Array) -> Array:
-    """The action (11,) with neck and focus as in `start` (11,)."""
-    held = action.copy()
-    held[NECK], held[FOCUS] = start[NECK], start[FOCUS]
-    return held
+def with_attention_of(start: Array, action: Array) -> Array:
+    """A copy of `action` (11,) with the neck angles and the focus of `start` (11,)."""
+    fixed = action.copy()
+    fixed[NECK], fixed[FOCUS] = start[NECK], start[FOCUS]
+    return fixed
 
 
 def targets_of_action(action: Array) -> JointTargets:

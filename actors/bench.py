@@ -1,4 +1,4 @@
-"""How fast an actor plays on this machine, and what its loop costs beside the simulator."""
+"""How fast an actor plays on this machine, and what its loop costs besides the simulator."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from actors.actor import Assignment, live_message
 from actors.attention import crop_of_focus, targets_of_action
 from actors.player import LiveStep, play
-from actors.policies.by_name import make_tutor
 from actors.policies.contract import Policy
+from actors.policies.planned import make_tutor
 from actors.simulator import Simulator, make_simulator
-from actors.tasks.contract import Situation, Task
-from actors.tasks.experiment1.plan import plan
+from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from learner.checkpoint import NETWORK_PREFIX, Checkpoint, CheckpointMetadata, CodeRanges
-from learner.network.numpy_network import NumpyNetwork, Parameters, make_acting_network
-from learner.network.subnets import parameter_shapes
+from learner.network.acting import make_acting_network
+from learner.network.numpy_network import NumpyNetwork
+from learner.network.subnets import Parameters, parameter_shapes
 from learner.network.vision_input import vision_input
 from learner.network_policy import NetworkPolicy
 from proto.body import ACTION_VALUES, FOCUS
@@ -34,27 +34,29 @@ from proto.episode import Floats, Image, Kind
 from proto.machine import machine_name
 from proto.messages import Rollout
 from proto.metrics import Stage
+from proto.variables import Situation
 
-ROUNDS: Final = 7
+REPETITIONS: Final = 7
+"""How often the loops that are compared are run."""
 LIMIT_S: Final = 17.0
-"""No further round begins after so long."""
+"""No further repetition begins after this time."""
 
 
 @dataclass(frozen=True)
 class ActorSpeed:
-    """What `bench_actor` measured; medians, which other work on the machine disturbs least.
+    """What `bench_actor` measured; medians, because other work on the machine disturbs them least.
 
     Attributes:
         machine: processor and number of cores.
         backend: name of the simulator.
         physics_ms: time of one physics step.
-        render_ms: time of one observation, rendering and all.
-        network_ms: time of one step of the network, from picture to action, as it acts.
-        network_numpy_ms: the same in numpy, as it acts where nothing can be compiled.
+        render_ms: time of one observation, with its rendering.
+        network_ms: time of one step of the network, from picture to action.
+        network_numpy_ms: the same in numpy, which acts where nothing can be compiled.
         core_ms: the part of `network_ms` that PFC, M_S, M_F and M_O take.
         steps_per_s: control steps per second of the actor's whole loop.
-        ratio: processor time of the whole loop over that of the bare simulator doing the same;
-            waiting, such as for a core that others use, does not count.
+        ratio: processor time of the whole loop, divided by that of the simulator alone in the same
+            episode. Waiting, such as for a core that others use, does not count.
         episode_s: time of one tutored episode.
     """
 
@@ -74,9 +76,9 @@ def bench_actor(config: Config) -> ActorSpeed:
     """Measure an actor in less than half a minute.
 
     The whole loop is an episode as the actor's process plays it while someone watches: observing,
-    the network, judging, recording, and encoding what goes to the bus. The bare loop does the same
-    in the simulator, and nothing else. They take turns, an episode each: a loop that another
-    interrupted at every step would find its data gone from the caches.
+    the network, judging, recording, and encoding what goes to the bus. It is compared with the same
+    actions in the simulator alone. The two take turns, an episode each: if they alternated step by
+    step, each would find its data gone from the processor's caches.
 
     Raises:
         UserError: the simulator cannot run on this machine.
@@ -84,101 +86,117 @@ def bench_actor(config: Config) -> ActorSpeed:
     task = make_task(config.task)
     situation = task.tutored()[len(task.tutored()) // 2]
     with closing(make_simulator(config.simulator)) as simulator:
-        theatre = _Theatre(simulator, task, situation)
-        tutor = make_tutor(config, noisy=False)
+        runner = _EpisodeRunner(simulator, task, situation)
+        tutor = make_tutor(task)
         checkpoint = _random_checkpoint(config.network)
-        pupil = _Pupil(NetworkPolicy(checkpoint, "the benchmark"), plan(situation))
-        others = _OtherNetworks(checkpoint)
-        tutored = _Laps()
-        theatre.play(tutor)  # warms up
+        policy = _TimedNetworkPolicy(
+            NetworkPolicy(checkpoint, "the benchmark"), task.plan(situation)
+        )
+        variants = _NetworkVariants(checkpoint)
+        tutored_timer = _Timer()
+        runner.run(tutor)  # warms up
         end = time.perf_counter() + LIMIT_S
-        for number in range(ROUNDS):
-            if number > 0 and time.perf_counter() > end:
+        for repetition in range(REPETITIONS):
+            if repetition > 0 and time.perf_counter() > end:
                 break
-            theatre.play_bare(pupil.actions)
-            theatre.play_measured(pupil)
-            if number % 2 == 0:  # the ratio needs more rounds than these
-                with tutored:
-                    theatre.play(tutor)
-                theatre.play(tutor, others.step)
+            runner.run_simulator_alone(policy.actions)
+            runner.run_whole_loop(policy)
+            if repetition % 2 == 0:  # the ratio needs more repetitions than the rest
+                with tutored_timer:
+                    runner.run(tutor)
+                runner.run(tutor, variants.step)
     return ActorSpeed(
         machine=machine_name(),
         backend=simulator.name,
-        physics_ms=1e3 * median(theatre.physics) / config.simulator.substeps,
-        render_ms=1e3 * median(theatre.render),
-        network_ms=1e3 * median(pupil.network_laps),
-        network_numpy_ms=1e3 * median(others.numpy_laps),
-        core_ms=1e3 * median(others.core_laps),
-        steps_per_s=1.0 / median(theatre.whole_time),
-        ratio=theatre.whole_work.typical() / theatre.bare_work.typical(),
-        episode_s=median(tutored),
+        physics_ms=1e3 * median(runner.physics_timer) / config.simulator.substeps,
+        render_ms=1e3 * median(runner.render_timer),
+        network_ms=1e3 * median(policy.network_timer),
+        network_numpy_ms=1e3 * median(variants.numpy_timer),
+        core_ms=1e3 * median(variants.core_timer),
+        steps_per_s=1.0 / median(runner.step_times_s),
+        ratio=runner.whole_loop_work.episode_s() / runner.simulator_work.episode_s(),
+        episode_s=median(tutored_timer),
     )
 
 
-class _Laps(list[float]):
-    """How long laps took, in seconds."""
+class _Timer(list[float]):
+    """Times a block of code each time it is run: `with timer: ...`. Its items are in seconds."""
 
     def __enter__(self) -> None:
-        self._started = time.perf_counter()
+        self._started_s = time.perf_counter()
 
     def __exit__(self, *_: object) -> None:
-        self.append(time.perf_counter() - self._started)
+        self.append(time.perf_counter() - self._started_s)
 
 
-class _Rounds:
-    """Processor time that each control step of the same episode took, round after round."""
+class _StepWork:
+    """Processor time of each control step of an episode that is run again and again."""
 
     def __init__(self) -> None:
-        self._rounds: list[list[float]] = []
-        self._began = math.nan
+        self._episodes_s: list[list[float]] = []
+        self._step_began_s = math.nan
 
-    def begin(self) -> None:
-        """Start a round."""
-        self._rounds.append([])
-        self._began = math.nan
+    def begin_episode(self) -> None:
+        """Begin an episode; it must have as many steps as those before it."""
+        self._episodes_s.append([])
+        self._step_began_s = math.nan
 
-    def lap(self) -> None:
-        """A control step is over; the first time it only begins."""
-        self._rounds[-1].append(time.process_time() - self._began)
-        self._began = time.process_time()
+    def end_step(self) -> None:
+        """Record the step that ends now. The first step of an episode has no known beginning."""
+        self._episodes_s[-1].append(time.process_time() - self._step_began_s)
+        self._step_began_s = time.process_time()
 
-    def typical(self) -> float:
-        """Seconds of all steps, each its median over the rounds."""
-        return float(np.median(self._rounds, axis=0)[1:].sum())
+    def episode_s(self) -> float:
+        """Seconds of all steps but the first, each step the median over the episodes."""
+        return float(np.median(self._episodes_s, axis=0)[1:].sum())
 
 
-class _Theatre:
-    """Plays one situation in several ways, and measures them."""
+class _EpisodeRunner:
+    """Runs the episode of one situation in several ways, and measures them.
+
+    Attributes:
+        render_timer: one observation, in the simulator alone.
+        physics_timer: one control step, in the simulator alone.
+        step_times_s: mean time of a control step of the whole loop, for each episode.
+        simulator_work: processor time of the simulator alone.
+        whole_loop_work: processor time of the whole loop.
+    """
 
     def __init__(self, simulator: Simulator, task: Task, situation: Situation) -> None:
-        self.whole_time, self.render, self.physics = _Laps(), _Laps(), _Laps()
-        self.whole_work, self.bare_work = _Rounds(), _Rounds()
+        self.render_timer, self.physics_timer = _Timer(), _Timer()
+        self.step_times_s: list[float] = []
+        self.simulator_work, self.whole_loop_work = _StepWork(), _StepWork()
         self._simulator = simulator
         self._task = task
         self._situation = situation
 
-    def play_bare(self, actions: NDArray[np.float64]) -> None:
-        """The simulator alone."""
+    def run_simulator_alone(self, actions: NDArray[np.float64]) -> None:
+        """Run the simulator with actions (T, 11), and nothing else."""
         self._simulator.reset(self._task.scene(self._situation))
-        self.bare_work.begin()
+        self.simulator_work.begin_episode()
         focus = float(self._task.start[FOCUS])
         for action in actions:
-            with self.render:
+            with self.render_timer:
                 self._simulator.observe(crop_of_focus(focus))
-            self.bare_work.lap()
-            with self.physics:
+            self.simulator_work.end_step()
+            with self.physics_timer:
                 self._simulator.step(targets_of_action(action))
             focus = float(action[FOCUS])
 
-    def play_measured(self, policy: Policy) -> None:
-        """The whole loop."""
-        self.whole_work.begin()
-        began = time.perf_counter()
-        self.play(policy, lambda _: self.whole_work.lap())
-        self.whole_time.append((time.perf_counter() - began) / len(self._task.phases))
+    def run_whole_loop(self, policy: Policy) -> None:
+        """Run the actor's loop with a policy, and measure it."""
+        self.whole_loop_work.begin_episode()
+        began_s = time.perf_counter()
+        self.run(policy, lambda _: self.whole_loop_work.end_step())
+        self.step_times_s.append((time.perf_counter() - began_s) / len(self._task.phases))
 
-    def play(self, policy: Policy, on_image: Callable[[Image], None] | None = None) -> None:
-        """An episode as the actor's process plays it, but for the wire itself."""
+    def run(self, policy: Policy, on_image: Callable[[Image], None] | None = None) -> None:
+        """Run an episode as the actor's process plays it, except that nothing is sent.
+
+        Args:
+            policy: what acts.
+            on_image: called in each step with what the robot sees.
+        """
         assignment = Assignment(Kind.TRIAL, self._task, policy, self._situation, seed=0)
 
         def on_step(live: LiveStep) -> None:
@@ -198,8 +216,13 @@ class _Theatre:
         encode(Rollout(episode, "bench"))
 
 
-class _Pupil:
-    """Steps a network, but does as the tutor would: all of its work, and a real grasp."""
+class _TimedNetworkPolicy:
+    """Runs the network in each step and times it, but acts as planned, so that the hand grasps.
+
+    Attributes:
+        actions: the planned actions (T, 11).
+        network_timer: one step of the network, from picture to action.
+    """
 
     name = "bench"
     version = 0
@@ -209,40 +232,45 @@ class _Pupil:
     def __init__(self, network: NetworkPolicy, actions: NDArray[np.float64]) -> None:
         self.actions = actions
         self.outputs: Floats | None = None
-        self.network_laps = _Laps()
+        self.network_timer = _Timer()
         self._network = network
 
     def begin(self, situation: Situation, seed: int) -> None:
         self._network.begin(situation, seed)
-        self._next = iter(self.actions)
+        self._remaining_actions = iter(self.actions)
 
     def step(self, image: Image) -> NDArray[np.float64]:
-        with self.network_laps:
+        with self.network_timer:
             self._network.step(image)
         self.outputs = self._network.outputs
-        return next(self._next)
+        return next(self._remaining_actions)
 
 
-class _OtherNetworks:
-    """The network again, in numpy and in parts, to be measured beside the one that acts."""
+class _NetworkVariants:
+    """The same network in numpy, and in parts.
+
+    Attributes:
+        numpy_timer: one step in numpy, from picture to action.
+        core_timer: the part of one step that PFC, M_S, M_F and M_O take.
+    """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
-        self.numpy_laps, self.core_laps = _Laps(), _Laps()
+        self.numpy_timer, self.core_timer = _Timer(), _Timer()
         parameters = cast("Parameters", checkpoint.part(NETWORK_PREFIX))
         self._numpy = NetworkPolicy(checkpoint, "the benchmark", NumpyNetwork)
         self._parts = make_acting_network(checkpoint.metadata.network, parameters)
 
     def step(self, image: Image) -> None:
-        """One step of each."""
-        with self.numpy_laps:
+        """Run one step of each."""
+        with self.numpy_timer:
             self._numpy.step(image)
         seen = self._parts.see(vision_input(image))
-        with self.core_laps:
+        with self.core_timer:
             self._parts.act(seen)
 
 
 def _random_checkpoint(config: NetworkConfig) -> Checkpoint:
-    """A network of the configured sizes that has learned nothing."""
+    """A network of the configured sizes with random weights."""
     rng = np.random.default_rng(0)
     tensors = {
         NETWORK_PREFIX + name: rng.uniform(-0.1, 0.1, shape).astype(np.float32)

@@ -10,6 +10,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from proto.cache import cache_folder
 from sim_assets.hand import PHALANGES, joints_from_motors
 from sim_assets.icub import (
     ARM_JOINTS,
@@ -29,8 +30,8 @@ _ROOT_IN_WORLD: Final = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 
 
 
 @dataclass(frozen=True)
-class Cuboid:
-    """A box that the arm must stay clear of, or may come close to.
+class ClearanceBox:
+    """A box whose distance to the arm is measured.
 
     Attributes:
         centre_m: (3,) centre in the world frame.
@@ -81,7 +82,7 @@ class Arm:
             motors_deg: (9,) hand motors.
             table_drop_m: how far the table top (world z = 0) lies below the root link.
         """
-        model = build_icub()
+        model = build_icub(cache_folder())
         full = pin.buildModelFromUrdf(str(model.urdf))
         posture = pin.neutral(full)
         angles = np.deg2rad(joints_from_motors(motors_deg))
@@ -146,7 +147,7 @@ class Gaze:
 
     def __init__(self, table_drop_m: float) -> None:
         """Freeze all joints but the neck's two."""
-        full = pin.buildModelFromUrdf(str(build_icub().urdf))
+        full = pin.buildModelFromUrdf(str(build_icub(cache_folder()).urdf))
         moving = {full.getJointId(name) for name in NECK_JOINTS}
         frozen = [joint for joint in range(1, full.njoints) if joint not in moving]
         self._model = pin.buildReducedModel(full, frozen, pin.neutral(full))

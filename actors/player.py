@@ -9,12 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.attention import attention_of, clip_action, crop_of_focus, targets_of_action
+from actors.attention import clip_action, crop_of_focus, targets_of_action, with_attention_of
 from actors.policies.contract import Policy
 from actors.simulator import Simulator
-from actors.tasks.contract import Situation, Task
+from actors.tasks.contract import Task
 from proto.body import FOCUS
 from proto.episode import Episode, Image, Kind
+from proto.variables import Situation
 
 Array = NDArray[np.float64]
 
@@ -25,14 +26,14 @@ class LiveStep:
 
     Attributes:
         step: control step, from 0.
-        phase: subtask of the paper, from 1.
+        phase: name of the phase.
         image: (48, 64) uint8, the network's picture.
         joints_deg: (18,) measured before the action.
         action: (11,) what the robot is told.
     """
 
     step: int
-    phase: int
+    phase: str
     image: Image
     joints_deg: Array
     action: Array
@@ -67,7 +68,7 @@ def play(
         action = _told(task, clip_action(policy.step(seen.image)))
         poses.append(simulator.bodies().rows)
         if on_step is not None:
-            on_step(LiveStep(step, int(phase), seen.image, seen.joints_deg, action))
+            on_step(LiveStep(step, task.phase_names[phase], seen.image, seen.joints_deg, action))
         report = simulator.step(targets_of_action(action))
         judge.watch(report, simulator.joints_deg(), simulator.bodies())
         images.append(seen.image)
@@ -92,6 +93,7 @@ def play(
         actions=np.asarray(actions, dtype=np.float32),
         targets=np.asarray(targets, dtype=np.float32),
         joints_deg=np.asarray(joints, dtype=np.float32),
+        phase_names=task.phase_names,
         phases=task.phases.copy(),
         body_names=names,
         body_poses=np.stack(poses).astype(np.float32),
@@ -103,4 +105,4 @@ def play(
 
 def _told(task: Task, action: Array) -> Array:
     """The action as far as the task leaves it to the policy."""
-    return action if task.attention == "active" else attention_of(task.start, action)
+    return action if task.attention == "active" else with_attention_of(task.start, action)

@@ -1,33 +1,35 @@
-"""The neutral simulator interface: a scene and joint targets in, observations and truth out.
+"""The simulator interface: a scene and joint targets in, observations and true poses out.
 
 World frame (right-handed): x to the robot's right, y forward, z up. The origin lies on the table
 top, straight below the origin of the robot's root link. The paper's task frame is left-handed:
 x_world = -X_task, y_world = Y_task, z_world = Z_task, and a yaw changes its sign.
 
-Nothing outside a backend's folder imports a simulator, and nothing is welded, attached or
-teleported while a scene runs: what is lifted is lifted by friction.
+Only a backend's own folder imports its simulator. During an episode nothing is welded, attached or
+teleported: what is lifted is lifted by friction.
 """
 
 from __future__ import annotations
 
-import importlib
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from proto.config import SimulatorConfig
-from proto.errors import UserError
+from proto.extensions import load_class
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 EYE_WIDTH: Final = 320
 EYE_HEIGHT: Final = 240
+DARK_SCREEN: Final = 20
+"""Grey level of a screen that shows nothing."""
 ROBOT: Final = "robot"
-"""Name under which the robot stands in contact reports."""
+"""Name of the robot in contact reports."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class Box:
 
 @dataclass(frozen=True)
 class JointTargets:
-    """What the motors are told, in degrees.
+    """Target angles of all motors, in degrees.
 
     Attributes:
         neck_deg: (2,) pitch, yaw.
@@ -104,19 +106,46 @@ class JointTargets:
     hand_deg: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """A flat screen that shows one grey frame in each control step. Nothing can touch it.
+
+    A screen glows: the picture shows its grey levels as they are, whatever the light.
+
+    Attributes:
+        size_m: width and height.
+        pose: of its centre; unturned, it stands upright and faces -y, towards the robot, with the
+            left edge of its frames at -x.
+        frames: (N, height, width) uint8; frame t is shown while the robot observes at control step
+            t, counted from 0. After the last frame the screen is dark.
+    """
+
+    size_m: tuple[float, float]
+    pose: Pose
+    frames: Image
+
+    def frame(self, step: int) -> Image:
+        """What the screen shows at a control step: (height, width) uint8."""
+        if step < len(self.frames):
+            return np.asarray(self.frames[step], dtype=np.uint8)
+        return np.full(self.frames.shape[1:], DARK_SCREEN, dtype=np.uint8)
+
+
 @dataclass(frozen=True)
 class Scene:
-    """All that one episode starts from.
+    """The initial state of an episode.
 
     Attributes:
         boxes: table, obstacle, objects.
-        start: posture of the robot; it starts at rest there.
+        start: posture in which the robot starts, at rest.
         table_drop_m: how far the table top lies below the robot's root link (m).
+        screen: a screen, if there is one.
     """
 
     boxes: tuple[Box, ...]
     start: JointTargets
     table_drop_m: float
+    screen: Screen | None = None
 
 
 @dataclass(frozen=True)
@@ -132,19 +161,17 @@ class Observation:
     """What the robot senses at one instant.
 
     Attributes:
-        image: (48, 64) uint8 grey picture of the crop asked for (V_I before normalization).
+        image: (48, 64) uint8 grey picture of the requested crop (V_I before normalization).
         joints_deg: (18,) measured angles: neck (2), arm (7), hand motors (9), in degrees.
-        finger_contact: whether any finger touches a moving box.
     """
 
     image: Image
     joints_deg: Array
-    finger_contact: bool
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What happened during one control step, looked at in every physics step.
+    """What happened during one control step, collected from all of its physics steps.
 
     Attributes:
         touches: (watched box, toucher) pairs; toucher is ROBOT or the name of a moving box.
@@ -153,41 +180,107 @@ class StepReport:
     touches: frozenset[tuple[str, str]]
 
 
-class Simulator(Protocol):
-    """A simulator that can play scenes; made once, reset for each episode.
+OTHER_SYSTEM: Final = "other"
+"""Key in `Diagnosis.packages` for all systems that have no key of their own."""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Whether a backend can render on this machine.
 
     Attributes:
-        name: what it is called in the config and in recordings.
-        control_period_s: how long one control step lasts (s).
+        works: whether it can.
+        found: one line that names what renders, or says what is wrong.
+        cure: what the user can do about it, in a few lines; empty if it works.
+        packages: arguments of `apt-get install` that provide the graphics driver, by system, such
+            as "debian-12" or "ubuntu-24.04" (ID and VERSION_ID of /etc/os-release), and for
+            OTHER_SYSTEM. Empty if it works, or if no package helps.
+    """
+
+    works: bool
+    found: str
+    cure: str = ""
+    packages: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def text(self) -> str:
+        """What was found and, if it does not work, what to do."""
+        return self.found if self.works else f"{self.found}.\n{self.cure}".rstrip()
+
+    def packages_for(self, system: str) -> tuple[str, ...]:
+        """The arguments of `apt-get install` for a system; empty where none are known."""
+        return self.packages.get(system, self.packages.get(OTHER_SYSTEM, ()))
+
+
+class Simulator(Protocol):
+    """A simulator that can play scenes; made once from a `SimulatorConfig`, reset for each episode.
+
+    With `SimulatorConfig.render` false it must run without any graphics driver, and every observed
+    image is black.
+
+    Attributes:
+        name: the backend's name in the config and in recordings; `make_simulator` sets it.
+        control_period_s: duration of one control step.
     """
 
     name: str
     control_period_s: float
 
+    @abstractmethod
+    def __init__(self, config: SimulatorConfig) -> None:
+        """Make the simulator.
+
+        Raises:
+            UserError: it cannot run on this machine; the message says what to do.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def diagnose() -> Diagnosis:
+        """Try to render on this machine; returns even if a graphics driver crashes."""
+
+    @abstractmethod
     def reset(self, scene: Scene) -> None:
-        """Replace whatever was there with `scene`; the same scene gives the same episode."""
+        """Replace the previous scene by `scene`; the same scene gives the same episode."""
 
+    @abstractmethod
     def step(self, targets: JointTargets) -> StepReport:
-        """Run one control period, moving the motors' targets linearly to `targets`."""
+        """Run one control period, moving the motors' targets linearly to `targets`.
 
+        Raises:
+            ValueError: a target is not a finite number.
+        """
+
+    @abstractmethod
     def observe(self, crop: Crop) -> Observation:
-        """Look through the left eye and feel the joints, now."""
+        """The network's picture of the left eye's crop, and the measured joints, now."""
 
+    @abstractmethod
     def joints_deg(self) -> Array:
         """Measured joint angles (18,) in degrees, without rendering."""
 
+    @abstractmethod
     def bodies(self) -> Bodies:
         """True pose of every box and of every moving link of the robot, by name."""
 
-    def show(self, joints_deg: Array, boxes: Mapping[str, Pose]) -> None:
-        """Put a recorded state on the stage for pictures; not for use during an episode."""
+    @abstractmethod
+    def show(self, joints_deg: Array, boxes: Mapping[str, Pose], step: int) -> None:
+        """Put robot, boxes and screen into a recorded state, for pictures; not during an episode.
 
+        Args:
+            joints_deg: (18,) joint angles, as `joints_deg` measures them.
+            boxes: poses of boxes by name; the others stay where they are.
+            step: control step of the recorded state, which the screen shows.
+        """
+
+    @abstractmethod
     def eye_picture(self, crop: Crop, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the left eye's crop."""
 
+    @abstractmethod
     def outside_picture(self, width: int, height: int) -> Image:
         """Colour picture (height, width, 3) uint8 of the scene from outside, full meshes."""
 
+    @abstractmethod
     def close(self) -> None:
         """Free what the simulator holds."""
 
@@ -195,25 +288,21 @@ class Simulator(Protocol):
 BACKENDS: Final[Mapping[str, str]] = {"sapien": "actors.backends.sapien.simulator:SapienSimulator"}
 
 
+def load_backend(name: str) -> type[Simulator]:
+    """The class of the backend with a name: one of BACKENDS, or `package.module:Class`.
+
+    Raises:
+        UserError: there is no such backend, or it lacks methods of `Simulator`.
+    """
+    return load_class("simulator.backend", name, BACKENDS, Simulator.__abstractmethods__)
+
+
 def make_simulator(config: SimulatorConfig) -> Simulator:
-    """Make the backend that `config.backend` names: one of BACKENDS or `package.module:Class`.
+    """Make the backend that `config.backend` names, and give it that name.
 
     Raises:
         UserError: there is no such backend, or it cannot run on this machine.
     """
-    path = BACKENDS.get(config.backend, config.backend)
-    module_name, separator, class_name = path.partition(":")
-    if not separator:
-        raise UserError(
-            f"simulator.backend: there is no backend {config.backend!r}. There are: "
-            f"{', '.join(sorted(BACKENDS))}; a backend of your own is named package.module:Class."
-        )
-    try:
-        factory = getattr(importlib.import_module(module_name), class_name)
-    except (ImportError, AttributeError) as error:
-        raise UserError(
-            f"simulator.backend: {config.backend!r} cannot be loaded ({error}). "
-            f"Built in are: {', '.join(sorted(BACKENDS))}."
-        ) from error
-    simulator: Simulator = factory(config)
+    simulator = load_backend(config.backend)(config)
+    simulator.name = config.backend
     return simulator

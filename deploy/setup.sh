@@ -1,7 +1,8 @@
 # shellcheck shell=bash
-# Sourced by run_local.sh and test.sh. `setup` brings this checkout to where it can run: Python, a
-# compiler, the locked packages in .venv, and a graphics driver that can render. What is there is
-# left alone, so that a second call takes about a second.
+# Sourced by run_local.sh and test.sh. `setup` installs what this checkout needs to run: Python, a
+# compiler, the locked packages in .venv, and a graphics driver with which the chosen simulator can
+# render. Its arguments are those of run_local.sh; they choose the simulator. It leaves alone what
+# is there, so that a second call takes about a second.
 
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="$ROOT/.venv"
@@ -11,7 +12,7 @@ setup() {
     setup_python
     setup_compiler
     setup_packages
-    setup_graphics
+    setup_graphics "$@"
 }
 
 say() { printf 'setup: %s\n' "$*" >&2; }
@@ -84,7 +85,7 @@ pip_install() {
         --root-user-action=ignore "$@" || fail "pip could not install; is the network there?"
 }
 
-# Two of the packages expect shared libraries that a bare system lacks: pin OpenMP, sapien X11.
+# Some of the packages expect shared libraries that a bare system lacks: OpenMP and X11.
 setup_libraries() {
     imports 2>/dev/null && return
     local libraries=(libgomp1 libx11-6)
@@ -93,34 +94,42 @@ setup_libraries() {
     imports || fail "the packages cannot be imported; see above"
 }
 
-imports() { "$VENV/bin/python" -W ignore -c 'import cv2, pinocchio, sapien'; }
+imports() {
+    (cd "$ROOT" && "$VENV/bin/python" -W ignore -c 'import cv2, pinocchio
+from actors.simulator import BACKENDS, load_backend
+for name in BACKENDS: load_backend(name)')
+}
 
 # --- graphics ---------------------------------------------------------------------------------
 
-# SAPIEN needs a Vulkan driver with VK_KHR_external_semaphore_fd: NVIDIA's, or Mesa's from 24.3 on.
+# Each simulator knows by itself whether it can render, and which packages provide its driver.
 setup_graphics() {
-    can_render && return
-    local packages=(mesa-vulkan-drivers libvulkan1) release=()
-    if [[ "$(system)" == debian-12 ]]; then
-        release=(-t bookworm-backports) # Debian 12 itself has Mesa 22.3
+    local answer packages status=0
+    answer="$(examine_graphics "$@" 2>/dev/null)" || status=$?
+    # 2: bad input, such as a simulator that does not exist; run_local.py says what is wrong with it
+    if ((status == 0 || status == 2)); then return; fi
+    read -ra packages <<<"$answer"
+    if ((${#packages[@]} == 0)); then
+        examine_graphics "$@" >/dev/null || fail "the simulator cannot render; see above"
     fi
     if ! can_install; then
-        explain_graphics || true
+        examine_graphics "$@" >/dev/null || true
         fail "no graphics driver that can render; start this once as root, or as root:" \
-            "$(apt_line "${release[@]}" "${packages[@]}")"
+            "$(apt_line "${packages[@]}")"
     fi
     say "installing the graphics driver (${packages[*]})"
-    if [[ "$(system)" == debian-12 ]]; then add_backports; fi
-    apt_install "${release[@]}" "${packages[@]}"
-    explain_graphics || fail "the graphics driver still cannot render; see above"
+    if [[ " ${packages[*]} " == *" bookworm-backports "* ]]; then add_backports; fi
+    apt_install "${packages[@]}"
+    examine_graphics "$@" >/dev/null || fail "the graphics driver still cannot render; see above"
 }
 
-can_render() { explain_graphics >/dev/null 2>&1; }
+# Succeeds where the chosen simulator can render. Else it prints the arguments for apt-get that cure
+# it, if any do, and says on standard error what is wrong and what to do.
+examine_graphics() {
+    "$VENV/bin/python" -m actors.backends --config "$ROOT/deploy/config/experiment1.yaml" "$@"
+}
 
-# Succeeds where SAPIEN can render; else says why not and what to do.
-explain_graphics() { "$VENV/bin/python" -m actors.backends.sapien.graphics >&2; }
-
-# Takes the mirror from which this machine has its Debian 12, whatever that is.
+# Adds bookworm-backports from the mirror that this machine takes Debian 12 from.
 add_backports() {
     local list=/etc/apt/sources.list.d/bookworm-backports.list
     if apt-get indextargets --format '$(RELEASE)' | grep -qx bookworm-backports; then return; fi
@@ -132,9 +141,6 @@ add_backports() {
 }
 
 # --- the system's packages --------------------------------------------------------------------
-
-# Prints the system's name and version, such as debian-12 or ubuntu-24.04.
-system() { (. /etc/os-release 2>/dev/null && echo "${ID:-unknown}-${VERSION_ID:-}"); }
 
 can_install() {
     command -v apt-get >/dev/null || return 1

@@ -208,7 +208,7 @@ process_name={name}
 numprocs={program.processes}
 numprocs_start=1
 priority={rank}
-environment=OMP_NUM_THREADS="{program.threads}",LP_NUM_THREADS="{program.threads}"
+environment=OMP_NUM_THREADS="{program.threads}"
 autostart=false
 autorestart=unexpected
 exitcodes=0,{BAD_INPUT}

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from safetensors.numpy import save as save_tensors
 from learner.network.softmax_code import SoftmaxCode
 from learner.network.subnets import parameter_shapes
 from learner.pretrained import checkpoint_path
-from proto.body import ACTION_SIZE
+from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import NetworkConfig, RivalKind
 from proto.errors import UserError
 from proto.metrics import Stage
@@ -33,6 +33,11 @@ Tensors = Mapping[str, NDArray[np.generic]]
 _METADATA_KEY: Final = "vmdnn"
 NETWORK_PREFIX: Final = "network."
 CLASSIFIER_PREFIX: Final = "classifier."
+_WINDOW_OF_FORMAT_1: Final = (0.75, 1.0)
+
+
+Classes = tuple[float, ...] | tuple[str, ...]
+"""The classes of a variable: centres of a continuous one, choices of a discrete one."""
 
 
 class _Model(BaseModel):
@@ -46,16 +51,28 @@ class CodeRanges(_Model):
     maxima: tuple[float, ...]
 
 
+class AskedMetadata(_Model):
+    """A question of pre-training.
+
+    Attributes:
+        classes: classes of the answer.
+        window: in which part of a sequence it is asked, see `proto.variables.Question`.
+    """
+
+    classes: Classes
+    window: tuple[float, float]
+
+
 class TrainingMetadata(_Model):
     """What only a training checkpoint has beside its tensors.
 
     Attributes:
         sequences: ids of the tutored sequences, in the order in which they were taken.
-        classes: centres of the classes of pre-training, by name of the situation's value.
+        asked: what pre-training asks, by name of the variable; empty in coupled training.
     """
 
     sequences: tuple[str, ...]
-    classes: dict[str, tuple[float, ...]]
+    asked: dict[str, AskedMetadata]
 
 
 class RivalMetadata(_Model):
@@ -74,14 +91,16 @@ class CheckpointMetadata(_Model):
     """What a checkpoint says about itself.
 
     Attributes:
-        format: version of this format.
+        format: version of this format. Format 1 did not name task and simulator.
         run: name of the run.
         version: policy version; 0 before the first policy.
         stage: stage of the training.
         epoch: epochs of that stage that are done.
         loss: loss of the last of them, or None.
         config_digest: digest of the effective configuration.
-        network: the network; of a rival only its pictures and outputs.
+        task: task that it was trained for; None where format 1 did not say.
+        backend: simulator whose pictures it was trained on; None where format 1 did not say.
+        network: the network; of a rival only its outputs count.
         code: ranges of the outputs; None as long as the network cannot act.
         cases: different situations that this stage has learned from; 0 if that was not counted.
         sequences: sequences that it has learned from; 0 if that was not counted.
@@ -89,13 +108,15 @@ class CheckpointMetadata(_Model):
         rival: None for VMDNN.
     """
 
-    format: Literal[1] = 1
+    format: Literal[1, 2] = 2
     run: str
     version: int
     stage: Stage
     epoch: int
     loss: float | None
     config_digest: str
+    task: str | None = None
+    backend: str | None = None
     network: NetworkConfig
     code: CodeRanges | None
     cases: int = 0
@@ -161,13 +182,7 @@ def checkpoint_from_bytes(blob: bytes, origin: str) -> Checkpoint:
             f"{origin} is a safetensors file, but not of vmdnn: it lacks the metadata"
             f" {_METADATA_KEY!r}"
         ) from error
-    try:
-        metadata = CheckpointMetadata.model_validate_json(text)
-    except ValidationError as error:
-        raise UserError(
-            f"{origin} was written by another version of vmdnn, or is damaged: {error}"
-        ) from error
-    checkpoint = Checkpoint(metadata, tensors)
+    checkpoint = Checkpoint(_metadata(text, origin), tensors)
     _check_tensors(checkpoint, origin)
     return checkpoint
 
@@ -224,6 +239,34 @@ def _fields(network: NetworkConfig) -> dict[str, object]:
         else:
             fields[f"network.{name}"] = value
     return fields
+
+
+def _metadata(text: str, origin: str) -> CheckpointMetadata:
+    try:
+        values = json.loads(text)
+        if isinstance(values, dict) and values.get("format", 1) == 1:
+            _convert_format_1(values, origin)
+        return CheckpointMetadata.model_validate(values)
+    except (json.JSONDecodeError, ValidationError, AttributeError) as error:
+        raise UserError(
+            f"{origin} was written by another version of vmdnn, or is damaged: {error}"
+        ) from error
+
+
+def _convert_format_1(values: dict[str, Any], origin: str) -> None:
+    """Drop the image size, which format 1 may name, and give each question its window."""
+    size = values.get("network", {}).pop("image", [IMAGE_WIDTH, IMAGE_HEIGHT])
+    if size != [IMAGE_WIDTH, IMAGE_HEIGHT]:
+        raise UserError(
+            f"{origin} is of a network for images of the size {size} (width, height), but the"
+            f" robot's images are {IMAGE_WIDTH} x {IMAGE_HEIGHT}; take another checkpoint"
+        )
+    training = values.get("training")
+    if training is not None:
+        training["asked"] = {
+            name: {"classes": classes, "window": _WINDOW_OF_FORMAT_1}
+            for name, classes in training.pop("classes", {}).items()
+        }
 
 
 def _check_tensors(checkpoint: Checkpoint, origin: str) -> None:

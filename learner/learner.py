@@ -18,6 +18,7 @@ from learner.training.training_run import (
     pretraining_is_over,
     write_policy,
 )
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.corrections import Round, Situations
 from learner.tutoring.curriculum import Curriculum
 from learner.tutoring.failures import TRIES, Shown
@@ -99,7 +100,7 @@ class Learner:
         self._stores = _stores(config)
         self._materials = self._make_materials()
         self._trainer = open_training(
-            config,
+            VMDNNRecipe(config, tasks[config.pretraining_task or config.task.name].questions),
             self._folder,
             self._materials[Stage.COUPLED].store,
             self._materials[Stage.PRETRAINING].store,
@@ -297,7 +298,7 @@ class Learner:
             if over:
                 self._trainer.save(pretraining_file(self._folder))
         self._pace.add()
-        if policy_is_due(self._trainer, self._config.learner):
+        if policy_is_due(self._trainer):
             with self._training:
                 write_policy(self._trainer, self._folder)
             # the training is on disk before its policy is published

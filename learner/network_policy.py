@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Self, cast
 
@@ -15,16 +15,15 @@ from learner.checkpoint import (
     checkpoint_from_bytes,
     load_checkpoint,
 )
-from learner.network.numpy_network import (
-    ActingNetwork,
-    NumpyNetwork,
-    Parameters,
-    make_acting_network,
-)
+from learner.network.acting import ActingNetwork, make_acting_network
+from learner.network.numpy_network import NumpyNetwork
+from learner.network.subnets import Parameters
 from learner.network.vision_input import vision_input
+from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import NetworkConfig
 from proto.episode import Floats, Image
 from proto.errors import UserError
+from proto.variables import Situation
 
 
 class NetworkPolicy:
@@ -61,7 +60,6 @@ class NetworkPolicy:
                 f"{origin} is from pre-training and cannot act yet; train further, or take a"
                 " later checkpoint"
             )
-        width, height = metadata.network.image
         parameters = cast("Parameters", checkpoint.part(NETWORK_PREFIX))
         self.name = metadata.run
         self.version = metadata.version
@@ -69,7 +67,6 @@ class NetworkPolicy:
         self._code = code
         self._network = make_network(metadata.network, parameters)
         self._sizes, self._parameters = metadata.network, parameters
-        self._image_shape = (height, width)
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
@@ -89,16 +86,16 @@ class NetworkPolicy:
         """
         return cls(checkpoint_from_bytes(blob, "the policy"), "the policy")
 
-    def begin(self, situation: Mapping[str, float], seed: int) -> None:  # noqa: ARG002
+    def begin(self, situation: Situation, seed: int) -> None:  # noqa: ARG002
         """Return to the neutral state; situation and seed mean nothing to a network."""
         self._network.reset()
 
     def step(self, image: Image) -> NDArray[np.float64]:
         """Next action (11,), within what the robot accepts, for the picture (48, 64) uint8."""
-        if image.shape != self._image_shape:
+        if image.shape != (IMAGE_HEIGHT, IMAGE_WIDTH):
             raise UserError(
-                f"the network looks at {self._image_shape} pictures (height, width), not"
-                f" {image.shape}; network.image and the camera must agree"
+                f"the network looks at {IMAGE_HEIGHT} x {IMAGE_WIDTH} pictures (height x width),"
+                f" not {image.shape}"
             )
         outputs = self._network.step(vision_input(image))
         self.outputs = np.asarray(outputs, np.float32).ravel()

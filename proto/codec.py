@@ -141,6 +141,21 @@ class Text:
 
 
 @dataclass(frozen=True)
+class NumberOrText:
+    """A finite number, or text; which of the two a value is stays with it."""
+
+    number: Number = Number()
+    text: Text = Text(64)
+
+    def pack(self, value: float | str) -> Plain:
+        return value if isinstance(value, str) else self.number.pack(value)
+
+    def unpack(self, plain: Plain, where: str, sizes: Sizes) -> float | str:
+        check = self.text if isinstance(plain, str) else self.number
+        return check.unpack(plain, where, sizes)
+
+
+@dataclass(frozen=True)
 class Choice:
     """One member of an enumeration of strings, by its value."""
 
@@ -345,7 +360,10 @@ class Record:
             if name not in plain and not isinstance(check, Added):
                 raise MessageError(_path(where, name), "is missing")
             values[name] = check.unpack(plain.get(name), _path(where, name), sizes)
-        return self.made(**values)
+        try:
+            return self.made(**values)
+        except ValueError as error:  # fields that are valid one by one, but not together
+            raise MessageError(where or "payload", str(error)) from error
 
 
 @dataclass(frozen=True)

@@ -94,8 +94,8 @@ class HubConfig(_Section):
     shared_memory: Switch = False
 
 
-TaskName = Literal["experiment1", "reaching"]
-"""Experiment I, and the same without an obstacle, for pre-training the vision."""
+TaskName = Annotated[str, Field(min_length=1, max_length=200)]
+"""A built-in task, or one of the user's own as `package.module:Class`."""
 
 
 Attention = Literal["active", "fixed"]
@@ -103,10 +103,24 @@ Attention = Literal["active", "fixed"]
 
 
 class TaskConfig(_Section):
-    """Which task is tutored and tested, and whether the robot moves gaze and focus in it."""
+    """Which task is tutored and tested, and whether gaze and focus have a part in it.
+
+    Attributes:
+        name: a task of `actors.tasks.registry`, or one's own as `package.module:Class`.
+        attention: whether the robot turns its head and focuses.
+
+    A task may have options of its own; it checks them itself, see `options`.
+    """
+
+    model_config = ConfigDict(extra="allow", frozen=True)
 
     name: TaskName = "experiment1"
     attention: Attention = "active"
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What the section holds besides the keys above."""
+        return dict(self.model_extra or {})
 
 
 class SimulatorConfig(_Section):
@@ -177,7 +191,6 @@ class MapsConfig(_Section):
 class NetworkConfig(_Section):
     """VMDNN (paper, section 4.1)."""
 
-    image: tuple[Count, Count] = (64, 48)
     mstnn_fast: MapsConfig = MapsConfig(maps=3, kernel=(22, 14), stride=2, tau=2)
     mstnn_slow: MapsConfig = MapsConfig(maps=6, kernel=(8, 6), stride=2, tau=30)
     pfc: SubnetConfig = SubnetConfig(units=20, tau=150)
@@ -209,23 +222,17 @@ class PretrainingConfig(_Section):
     On the bus the learner first asks the actors for the sequences of pre-training: each of `cases`
     (indices of the tutored cases of `task`, None for all) `repeats` times. It starts with
     `start_sequences` of them, or with all if they are fewer. Without a task of its own, and in
-    `vmdnn train` without --pretraining-data, the sequences of coupled training serve.
+    `vmdnn train` without --pretraining-data, the sequences of coupled training serve. What is asked
+    about them is the task's to say.
     """
 
-    task: Literal["reaching"] | None = "reaching"
+    task: TaskName | None = None
     cases: tuple[Natural, ...] | None = None
     repeats: Repeats = 4
     start_sequences: Count = 60
     epochs: Natural = 30
     rate: Positive = 2e-3
     batch: Count = 15
-    # values of the situation that are asked for, and in how many classes
-    labels: Annotated[dict[str, AtLeastTwo], Field(min_length=1)] = {
-        "object_y_m": 3,
-        "object_yaw_deg": 5,
-    }
-    # last part of a sequence in which the answer is asked for
-    answer_part: Annotated[float, Field(strict=True, gt=0, le=1)] = 0.25
     # disturbance of the pictures, another one for each sequence and epoch: largest shift in pixels,
     # standard deviations of contrast and brightness, and of each pixel (brightness is -1..1)
     image_shift: Natural = 3
@@ -393,10 +400,16 @@ class Config(_Section):
         return self.run.folder / self.run.name
 
     @property
-    def pretraining_task(self) -> TaskName | None:
+    def pretraining_task(self) -> str | None:
         """Task of the sequences of pre-training; None if it uses those of coupled training."""
         first = self.learner.pretraining
         return None if first.epochs == 0 or first.task == self.task.name else first.task
+
+    def task_called(self, name: str) -> TaskConfig:
+        """The section `task` for another task, of which it knows no options."""
+        if name == self.task.name:
+            return self.task
+        return TaskConfig(name=name, attention=self.task.attention)
 
     @model_validator(mode="after")
     def _can_find_failures(self) -> Self:

@@ -11,7 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
-from proto.codec import Added, Array, Integer, Many, Maybe, Number, Size, Table, Text
+from proto.codec import (
+    Added,
+    Array,
+    Integer,
+    Many,
+    Maybe,
+    Number,
+    Size,
+    Table,
+    Text,
+    record_of,
+)
+from proto.variables import SituationField
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
@@ -22,6 +34,7 @@ LARGEST_DEG: Final = 360.0
 """No joint angle or level is larger."""
 STEPS: Final = Size("T", 1, 2000)
 BODIES: Final = Size("B", 0, 256)
+PHASES: Final = Size("phases", 1, 255)
 Id = Annotated[str, Text(64, r"[A-Za-z0-9][A-Za-z0-9._-]*")]
 """Names an episode, a process or a run; may stand in a key and in a file name."""
 
@@ -41,51 +54,57 @@ class Kind(StrEnum):
     PRACTICE = "practice"
 
 
-class Reason(StrEnum):
-    """Why an episode fell short of `precise`; the first that applies, in this order."""
+NO_FAILURE: Final = "none"
+"""The reason of an outcome that is precise."""
+ReasonField = Annotated[str, Text(64, r"[a-z][a-z0-9_]*")]
 
-    NONE = "none"
-    TOUCHED_OBSTACLE = "touched_obstacle"
-    MOVED_OBJECT = "moved_object"
-    NEVER_CLOSED = "never_closed"
-    NOT_LIFTED = "not_lifted"
-    IMPRECISE = "imprecise"
-    SIMULATION_FAILED = "simulation_failed"
+
+@dataclass(frozen=True)
+class Measure:
+    """A number that was measured in an episode.
+
+    Attributes:
+        value: the number.
+        unit: its unit, such as `mm`, `deg` or `step`; empty if it has none.
+    """
+
+    value: Annotated[float, Number()]
+    unit: Annotated[str, Text(16)]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an episode ended, in the three readings of success.
+    """How an episode ended, in the three readings of success. The task says what each asks for.
 
     Attributes:
-        lenient: the object ended more than 5 cm above its start.
-        strict: lifted and held, obstacle untouched, object at most 10 mm moved and 5 degrees
-            turned before the hand closed.
-        precise: strict, and the hand's pose to the object was right when it closed.
-        reason: why it was not precise.
-        lifted_m: height of the object above its start at the end (m).
-        moved_mm: how far the object was moved before the hand closed.
-        turned_deg: how far the object was turned before the hand closed.
-        yaw_error_deg: yaw of the hand's grasp axis less the object's when the hand closed, in the
-            task frame, -90..90.
-        along_mm: offset of the grasp centre along the object's long axis when the hand closed.
-        across_mm: offset across it.
-        closed_at: control step at which the hand closed, or -1.
-        obstacle_touched_at: first control step in which the obstacle was touched, or -1.
+        lenient: the paper's reading.
+        strict: a reading that a robot without eyes seldom passes.
+        precise: strict, and the hand was placed right.
+        reason: why it was not precise, a word of the task such as `not_lifted`; NO_FAILURE if it
+            was.
+        measures: what the task measured, by name.
     """
 
     lenient: bool
     strict: bool
     precise: bool
-    reason: Reason
-    lifted_m: float
-    moved_mm: float
-    turned_deg: float
-    yaw_error_deg: float
-    along_mm: float
-    across_mm: float
-    closed_at: int
-    obstacle_touched_at: int
+    reason: ReasonField
+    measures: Annotated[Mapping[str, Measure], Table(record_of(Measure), most=64)]
+
+    def __post_init__(self) -> None:
+        """Raise ValueError unless precise implies strict, strict lenient, and the reason fits."""
+        if self.precise > self.strict or self.strict > self.lenient:
+            raise ValueError("an outcome that is precise is strict, and one that is strict lenient")
+        if self.precise != (self.reason == NO_FAILURE):
+            raise ValueError(f"reason {self.reason!r} does not fit precise = {self.precise}")
+
+    def value(self, measure: str) -> float:
+        """The value of a measure; KeyError if the task does not measure it."""
+        return self.measures[measure].value
+
+
+SIMULATION_FAILED: Final = Outcome(False, False, False, "simulation_failed", {})
+"""Outcome of a trial whose simulation gave no valid episode; nothing was measured."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +117,7 @@ class Episode:
         id: random hexadecimal id, unique.
         kind: why it was played.
         task: name of the task.
-        situation: the situation's values by name, in the paper's task frame.
+        situation: the values of the task's variables by name, in the paper's task frame.
         seed: seed of everything random in it.
         actor: id of the process that played it.
         backend: name of the simulator.
@@ -110,7 +129,8 @@ class Episode:
         targets: (T, 11) float32, what was meant: the clean plan where the tutor executed it with
             noise or guided a policy, else equal to the actions.
         joints_deg: (T, 18) float32, measured before the action: neck, arm, hand motors.
-        phases: (T,) uint8, subtask 1..8 of the paper's Experiment I.
+        phase_names: names of the task's phases in their order.
+        phases: (T,) uint8, index into phase_names of each step.
         body_names: names of the bodies, B of them.
         body_poses: (T, B, 7) float32, position (m) and quaternion (w first) in the world frame.
         outcome: how it ended.
@@ -125,7 +145,7 @@ class Episode:
     id: Id
     kind: Kind
     task: str
-    situation: Annotated[Mapping[str, float], Table(Number(), most=32)]
+    situation: SituationField
     seed: Annotated[int, Integer(0, 2**63 - 1)]
     actor: Id
     backend: str
@@ -136,7 +156,8 @@ class Episode:
     actions: Annotated[Floats, Array("float32", (STEPS, ACTION_SIZE), -LARGEST_DEG, LARGEST_DEG)]
     targets: Annotated[Floats, Array("float32", (STEPS, ACTION_SIZE), -LARGEST_DEG, LARGEST_DEG)]
     joints_deg: Annotated[Floats, Array("float32", (STEPS, JOINTS), -LARGEST_DEG, LARGEST_DEG)]
-    phases: Annotated[NDArray[np.uint8], Array("uint8", (STEPS,), 1, 8)]
+    phase_names: Annotated[tuple[str, ...], Many(Text(64), PHASES)]
+    phases: Annotated[NDArray[np.uint8], Array("uint8", (STEPS,))]
     body_names: Annotated[tuple[str, ...], Many(Text(64), BODIES)]
     body_poses: Annotated[Floats, Array("float32", (STEPS, BODIES, 7), -1e3, 1e3)]
     outcome: Outcome
@@ -149,6 +170,13 @@ class Episode:
         Added(Table(Array("float32", (STEPS, Size("units", 1, 65536, own=True))), most=16)),
     ] = field(default=None)
     training: Annotated[str, Text(64)] = ""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if a step is in a phase without a name."""
+        if len(self.phases) and int(self.phases.max()) >= len(self.phase_names):
+            raise ValueError(
+                f"phases: a step is in phase {self.phases.max()} of {len(self.phase_names)}"
+            )
 
     @property
     def steps(self) -> int:

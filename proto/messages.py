@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Final
 
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
-from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Table, Text, message
+from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Text, message
 from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind, Outcome
 from proto.keys import Role
 from proto.seeds import SEEDS_PER_CASE
+from proto.variables import SituationField
 
 EPISODE_LIMIT: Final = 32 * MEBIBYTE
 POLICY_LIMIT: Final = 256 * MEBIBYTE
 
 Count = Annotated[int, Integer(0, 2**31)]
 Seed = Annotated[int, Integer(0, 2**63 - 1)]
-Values = Annotated[Mapping[str, float], Table(Number(), most=32)]
 
 PolicyKey = tuple[str, int]
 """What identifies a policy: id of its training, and its version."""
@@ -93,7 +92,7 @@ class EpisodeFailed:
     kind: Kind
     task: Annotated[str, Text(64)]
     seed: Seed
-    situation: Values
+    situation: SituationField
     training: Annotated[str, Text(64)]
     policy_version: Count
     problem: Annotated[str, Text(1000)]
@@ -150,7 +149,7 @@ class TutoringCase:
         return self.case * SEEDS_PER_CASE + self.repeat
 
 
-@message("correction", 1)
+@message("correction", 2)
 @dataclass(frozen=True)
 class Correction:
     """A situation in which the actor's policy acts while the tutor guides it.
@@ -163,10 +162,10 @@ class Correction:
 
     task: Annotated[str, Text(64)]
     seed: Seed
-    situation: Values
+    situation: SituationField
 
 
-@message("verdict", 1)
+@message("verdict", 2)
 @dataclass(frozen=True)
 class Verdict:
     """How an episode of practice ended; the learner tutors where the policy failed.
@@ -184,7 +183,7 @@ class Verdict:
     policy_version: Count
     task: Annotated[str, Text(64)]
     seed: Seed
-    situation: Values
+    situation: SituationField
     outcome: Outcome
 
 
@@ -210,7 +209,7 @@ class Trial:
     seed: Seed
 
 
-@message("live", 2)
+@message("live", 3)
 @dataclass(frozen=True)
 class Live:
     """One control step as it happens.
@@ -221,7 +220,7 @@ class Live:
         policy: name of the policy.
         policy_version: version of the policy.
         step: control step, from 0.
-        phase: subtask of the paper, 1..8.
+        phase: name of the phase.
         image: (48, 64) uint8, the network's grey picture.
         joints_deg: (18,) float32, neck, arm and hand as measured.
         action: (11,) float32, the action that the robot executes.
@@ -232,7 +231,7 @@ class Live:
     policy: str
     policy_version: Count
     step: Count
-    phase: Annotated[int, Integer(1, 8)]
+    phase: Annotated[str, Text(64)]
     image: Annotated[Image, Array("uint8", (IMAGE_HEIGHT, IMAGE_WIDTH))]
     joints_deg: Annotated[Floats, Array("float32", (JOINTS,), -LARGEST_DEG, LARGEST_DEG)]
     action: Annotated[Floats, Array("float32", (ACTION_SIZE,), -LARGEST_DEG, LARGEST_DEG)]

@@ -16,10 +16,11 @@ from proto.codec import (
     Number,
     Size,
     Table,
+    Text,
     message,
     record_of,
 )
-from proto.episode import Id, Kind, Reason
+from proto.episode import Id, Kind
 from proto.keys import Role
 
 Count = Annotated[int, Integer(0, 2**53)]
@@ -67,7 +68,7 @@ class ActorMetrics(Metrics):
     policy_version: Count
     steps_per_s: Rate
     episodes: Count
-    last_outcome: Annotated[Reason | None, Maybe(Choice(Reason))]
+    last_outcome: Annotated[str | None, Maybe(Text(64))]
     last_kind: Annotated[Kind | None, Maybe(Choice(Kind))]
     backend: str
     outbox: Count
@@ -145,9 +146,7 @@ class PolicyScore:
     Attributes:
         version: the policy version.
         trials: trials counted, at least one.
-        lenient: lifted at the end, the paper's reading.
-        strict: lifted and held, obstacle untouched, object not shoved.
-        precise: strict, and the hand was placed right.
+        lenient, strict, precise: see `proto.episode.Outcome`.
         reasons: how many trials fell short of `precise`, by reason.
     """
 

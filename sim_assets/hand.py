@@ -41,15 +41,15 @@ class Phalanx:
     The link is a capsule from the joint along the link's own x axis.
 
     Attributes:
-        joint: joint name; the link is named alike, without `_joint`.
+        joint: name of the joint: that of the link with `_joint` at its end.
         parent: link that carries the joint.
-        origin_m: place of the joint in the parent link (m).
+        origin_m: position of the joint in the parent link (m).
         parent_yaw_deg: turn of the joint's frame about the parent's z axis.
         axis: axis of rotation in the joint's frame; a positive angle flexes.
         length_m: length of the link (m).
         motor: motor that drives the joint.
         gain: joint angle = offset_deg + gain * motor angle.
-        offset_deg: see gain.
+        offset_deg: joint angle when the motor is at zero.
     """
 
     joint: str
@@ -61,6 +61,11 @@ class Phalanx:
     motor: str
     gain: float
     offset_deg: float = 0.0
+
+    @property
+    def link(self) -> str:
+        """Name of the link that the joint moves."""
+        return self.joint.removesuffix("_joint")
 
 
 MOTORS: Final = (
@@ -88,11 +93,14 @@ def _finger(
     gains: tuple[float, float, float],
     spread: float,
 ) -> tuple[Phalanx, ...]:
-    """A finger: an optional spreading joint (spread = its sign, 0 for none) and three phalanges."""
+    """A finger of three phalanges, with a joint before them that spreads it sideways, or without.
+
+    `spread` is 0 without that joint, else the sign of its angle when the fingers are spread.
+    """
     links: list[Phalanx] = []
     parent, place = "r_hand_dh_frame", base_m
     if spread:
-        # hand_finger 60 closes the fan, 0 spreads each finger by 20 degrees
+        # At hand_finger 60 the fingers are parallel, at 0 each is spread by 20 degrees.
         links.append(
             Phalanx(
                 f"r_{name}_0_joint", parent, base_m, 0.0, (0.0, 0.0, 1.0), knuckle_m,
@@ -152,9 +160,9 @@ _OFFSET_DEG: Final = np.array([p.offset_deg for p in PHALANGES])
 _DECOUPLING: Final = np.linalg.pinv(_COUPLING)
 
 OPEN_DEG: Final = np.array([60.0, 85.0, 42.0, 50.0, 0.0, 10.0, 0.0, 10.0, 10.0])
-"""Motor angles at grasp level 1: a pre-shape somewhat wider than the object."""
+"""Motor angles at grasp level 1: the hand is open somewhat wider than the object."""
 CLOSED_DEG: Final = np.array([60.0, 85.0, 62.0, 64.0, 38.0, 36.0, 38.0, 36.0, 75.0])
-"""Motor angles at grasp level 10; contact stops the fingers before they get there."""
+"""Motor angles at grasp level 10; an object in the hand stops the fingers before that."""
 
 _PINCH_TILT: Final = np.deg2rad(75.0)
 GRASP_AXIS: Final = np.array([np.cos(_PINCH_TILT), 0.0, -np.sin(_PINCH_TILT)])
@@ -162,7 +170,7 @@ GRASP_AXIS: Final = np.array([np.cos(_PINCH_TILT), 0.0, -np.sin(_PINCH_TILT)])
 APPROACH_AXIS: Final = np.array([np.sin(_PINCH_TILT), 0.0, np.cos(_PINCH_TILT)])
 """Unit vector in the hand frame along which the open hand slides over an object."""
 GRASP_CENTRE_M: Final = -0.006 * GRASP_AXIS + 0.060 * APPROACH_AXIS + np.array([0.0, -0.012, 0.0])
-"""Point in the hand frame, midway between thumb and fingers, that meets the object's centre."""
+"""Where a grasped object's centre lies in the hand frame: midway between thumb and fingers."""
 
 
 def motors_from_grasp(level: float) -> NDArray[np.float64]:
@@ -172,7 +180,7 @@ def motors_from_grasp(level: float) -> NDArray[np.float64]:
 
 
 def closing_fraction(motors_deg: NDArray[np.float64]) -> float:
-    """How far the hand is closed (0 open, 1 closed), by least squares over the motors (9,)."""
+    """How far the hand is closed, 0 (open) to 1 (closed): least squares over motor angles (9,)."""
     stroke = CLOSED_DEG - OPEN_DEG
     return float(stroke @ (motors_deg - OPEN_DEG) / (stroke @ stroke))
 

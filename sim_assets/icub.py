@@ -1,16 +1,15 @@
-"""The robot: the official iCub, pruned to what the tasks move, with a right hand of our own.
+"""The robot: the official iCub, reduced to what the tasks move, with a right hand of our own.
 
 The kinematics, masses and meshes are those of `iCubGazeboV2_5` in the `icub-models` package (CC
-BY-SA 4.0). Kept are the chains from the root to the head and to the right hand; only the neck's
-pitch and yaw, the right arm and the fingers (`sim_assets.hand`) still move. A left eye is added.
-Colliders are primitives, because meshes cost ten times as much physics time.
+BY-SA 4.0). The chains from the root to the head and to the right hand are kept. In them only the
+neck's pitch and yaw, the right arm and the fingers (`sim_assets.hand`) move. A left eye is added.
+Colliders are simple shapes, because meshes cost ten times as much physics time.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-import os
 import shutil
 import tempfile
 import xml.etree.ElementTree as ET
@@ -89,18 +88,17 @@ Collider = Capsule | Cuboid
 
 
 def _finger_colliders() -> Iterable[Capsule]:
-    """The phalanges that stick out of the palm; the tips end in a round cap inside their length."""
+    """Colliders of the phalanges outside the palm; a fingertip's axis ends 4 mm before its tip."""
     parents = {phalanx.parent for phalanx in hand.PHALANGES}
     for phalanx in hand.PHALANGES:
-        link = phalanx.joint.removesuffix("_joint")
-        if not link.endswith("_0"):
-            tip_m = 0.0 if link in parents else -0.004
+        if not phalanx.link.endswith("_0"):
+            tip_m = 0.0 if phalanx.link in parents else -0.004
             end_m = (phalanx.length_m + tip_m, 0.0, 0.0)
-            yield Capsule(link, (0.0, 0.0, 0.0), end_m, hand.FINGER_RADIUS_M)
+            yield Capsule(phalanx.link, (0.0, 0.0, 0.0), end_m, hand.FINGER_RADIUS_M)
 
 
 COLLIDERS: Final[tuple[Collider, ...]] = (
-    # Radii: the median distance of the covers' surfaces from these axes, less two millimetres.
+    # Radii: the median distance of the covers' surfaces from these axes, minus two millimetres.
     Capsule("r_upper_arm", (-0.015, 0.0, -0.005), (-0.015, 0.0, 0.075), 0.036),
     Capsule("r_forearm", (0.010, 0.0, -0.008), (-0.088, 0.0, 0.020), 0.034),
     Capsule("r_wrist_1", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.022),
@@ -115,9 +113,10 @@ class IcubModel:
 
     Attributes:
         urdf: kinematics and masses. Root frame: x back, y right, z up.
-        colliders: the shapes that touch things; most URDF readers know no capsules.
+        colliders: the shapes that touch other bodies. They are not in the URDF, because most URDF
+            readers do not know capsules.
         joints: names of the joints that move: neck, arm, then phalanges.
-        seen_by_eye: what the left eye sees of its own body, in simple meshes.
+        seen_by_eye: what the left eye can see of the robot, in simplified meshes.
         seen_from_outside: the whole robot in full detail.
     """
 
@@ -128,17 +127,19 @@ class IcubModel:
     seen_from_outside: tuple[Visual, ...]
 
 
-def build_icub(cache: Path | None = None) -> IcubModel:
-    """Build the robot, or find it in the cache folder.
+def build_icub(cache: Path) -> IcubModel:
+    """Build the robot in the folder `cache`, or find it there.
 
-    The folder is `cache`, else the environment variable VMDNN_CACHE, else `~/.cache/vmdnn`. Many
-    processes may build at once: each builds under a name of its own and renames it when done.
+    Many processes may build at once: each builds in a folder of its own and renames it when done.
+
+    Raises:
+        OSError: a mesh cannot be read, or the folder cannot be written.
     """
     official = Path(icub_models.get_model_file(SOURCE_MODEL))
     meshes = official.parents[3]  # SHARE/iCub/robots/MODEL/model.urdf; package:// is SHARE
     source = urdf.Tree(ET.parse(official).getroot())
     inputs = [official, *icub_visuals.mesh_files(source, meshes)]
-    folder = _cache_folder(cache) / f"icub-{_digest(inputs)}"
+    folder = cache / f"icub-{_digest(inputs)}"
     if not folder.is_dir():
         _build_into(folder, source, meshes)
     return IcubModel(
@@ -150,14 +151,8 @@ def build_icub(cache: Path | None = None) -> IcubModel:
     )
 
 
-def _cache_folder(cache: Path | None) -> Path:
-    if cache is not None:
-        return cache
-    return Path(os.environ.get("VMDNN_CACHE") or Path.home() / ".cache" / "vmdnn")
-
-
 def _digest(inputs: Iterable[Path]) -> str:
-    """Sixteen hexadecimal digits over everything that the build depends on, this code too."""
+    """Sixteen hexadecimal digits that change with the input files and with this code."""
     code = [Path(str(module.__file__)) for module in (hand, icub_visuals, urdf)]
     digest = hashlib.sha256()
     for path in (*inputs, *code, Path(__file__)):
@@ -178,14 +173,14 @@ def _build_into(folder: Path, source: urdf.Tree, meshes: Path) -> None:
         try:
             unfinished.rename(folder)
         except OSError:
-            if not folder.is_dir():  # else another process was faster
+            if not folder.is_dir():  # if it is, another process has just built it
                 raise
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _robot(source: urdf.Tree) -> ET.Element:
-    """The pruned and completed URDF."""
+    """The reduced URDF, with eye and hand."""
     robot = ET.Element("robot", name="icub")
     robot.append(_official_link(source.links[ROOT]))
     for joint in _kept_joints(source):
@@ -220,7 +215,7 @@ def _official_joint(source: ET.Element) -> ET.Element:
 
 
 def _append_eye(robot: ET.Element, head: urdf.Matrix) -> None:
-    """Fix the eye to the head, whose pose in the root frame at zero is given."""
+    """Add the eye, fixed to the head; `head` is its pose (4, 4) in the root frame at zero."""
     level = np.diag([-1.0, -1.0, 1.0])  # the root's x points back
     eye = np.eye(4)
     eye[:3, :3] = level @ urdf.rotation_from_rpy((0.0, math.radians(-EYE_TILT_DEG), 0.0))
@@ -235,13 +230,12 @@ def _append_eye(robot: ET.Element, head: urdf.Matrix) -> None:
 
 
 def _append_phalanx(robot: ET.Element, phalanx: hand.Phalanx) -> None:
-    name = phalanx.joint.removesuffix("_joint")
-    link = ET.SubElement(robot, "link", name=name)
+    link = ET.SubElement(robot, "link", name=phalanx.link)
     link.append(urdf.inertial(0.02, 1.5e-6, (phalanx.length_m / 2, 0.0, 0.0)))
     joint = ET.SubElement(robot, "joint", name=phalanx.joint, type="revolute")
     joint.append(urdf.origin(phalanx.origin_m, (0.0, 0.0, math.radians(phalanx.parent_yaw_deg))))
     ET.SubElement(joint, "parent", link=phalanx.parent)
-    ET.SubElement(joint, "child", link=name)
+    ET.SubElement(joint, "child", link=phalanx.link)
     ET.SubElement(joint, "axis", xyz=urdf.text(phalanx.axis))
     motor = next(motor for motor in hand.MOTORS if motor.name == phalanx.motor)
     ends = [

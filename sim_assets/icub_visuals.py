@@ -1,7 +1,7 @@
-"""How the robot looks: the official meshes, and a hand of ours.
+"""The robot's visible shapes: the official meshes, and a hand of our own.
 
-Two sets are made. The *eye* set holds what the left eye can see of its own body, simplified,
-because it is drawn in every control step. The *outside* set is the whole robot in full detail.
+Two sets are made. The *eye* set holds what the left eye can see of the robot, simplified because it
+is drawn in every control step. The *outside* set holds the whole robot in full detail.
 """
 
 from __future__ import annotations
@@ -21,9 +21,8 @@ from sim_assets import hand
 from sim_assets.urdf import Matrix, Tree, Vector, find, numbers, origin_pose
 
 Colour = tuple[float, float, float]
-Look = Literal["eye", "outside"]
+SetName = Literal["eye", "outside"]
 
-LOOKS: Final[tuple[Look, ...]] = ("eye", "outside")
 MANIFEST: Final = "visuals.json"
 
 EYE_LINKS: Final = (
@@ -36,24 +35,32 @@ EYE_LINKS: Final = (
     "r_forearm",
     "r_wrist_1",
 )
-"""Official links that come into the eye's view."""
+"""Official links that the left eye can see."""
 EYE_FACES: Final = 800
-"""Triangles of each official mesh in the eye's view."""
+"""Triangles of each official mesh in the eye set, at most."""
 EYE_HAND_FACES: Final = 80
-"""Triangles of each part of our hand in the eye's view."""
+"""Triangles of each part of our hand in the eye set, at most."""
 CREASE_DEG: Final = 35.0
-"""Edges sharper than this stay sharp; the rest is shaded smoothly."""
+"""Edges with a larger angle between their faces stay sharp; all others are shaded smoothly."""
 
-# The left arm and the legs do not move in any task; they only stand there to be seen.
+# The left arm and the legs do not move in any task. They are only shown, in this posture.
 STANDING_POSTURE_DEG: Final[Mapping[str, float]] = {
     "l_shoulder_pitch": 10.0,
     "l_shoulder_roll": 12.0,
     "l_elbow": 16.0,
 }
-_DECORATION: Final = ("l_", "r_hip", "r_upper_leg", "r_lower_leg", "r_ankle", "r_foot", "r_sole")
+_UNMOVED_PREFIXES: Final = (
+    "l_",
+    "r_hip",
+    "r_upper_leg",
+    "r_lower_leg",
+    "r_ankle",
+    "r_foot",
+    "r_sole",
+)
 
-# The network sees grey only. In linear luminance: hand, wrist and covers 0.03 to 0.1; objects, an
-# obstacle and a table from 0.3 up. The official red of the covers would be an object's grey.
+# The network sees only grey values. Linear luminance of hand, wrist and covers is 0.03 to 0.1; of
+# objects, obstacle and table at least 0.3. The covers' official red would have an object's grey.
 _OFFICIAL_RED: Final = "0.635 0.137 0.114"
 _COVERS: Final[Colour] = (0.20, 0.03, 0.03)
 _BODY: Final[Colour] = (0.75, 0.75, 0.75)
@@ -65,7 +72,7 @@ _TIP: Final[Colour] = (0.05, 0.05, 0.055)
 
 @dataclass(frozen=True)
 class Visual:
-    """One mesh of one colour on one link.
+    """A mesh of one colour on one link.
 
     Attributes:
         link: link that carries it.
@@ -80,39 +87,47 @@ class Visual:
 
 @dataclass(frozen=True)
 class _Part:
+    """A mesh of one colour on one link, not yet written.
+
+    Attributes:
+        link: link that carries it.
+        mesh: triangles in the link's frame (m).
+        colour: red, green, blue in 0..1, linear.
+    """
+
     link: str
     mesh: trimesh.Trimesh
     colour: Colour
 
 
 def write_visuals(folder: Path, source: Tree, meshes: Path, links: Iterable[str]) -> None:
-    """Write both sets and their list into a folder.
+    """Write both sets, and a file that lists them, into a folder.
 
     Args:
-        folder: where to write.
+        folder: where to write; it exists.
         source: the official model.
         meshes: the folder that `package://` stands for.
         links: the official links that the built robot keeps.
     """
-    kept = [link for link in links if link != "r_hand"]  # ours replaces the official hand
+    kept = [link for link in links if link != "r_hand"]  # our hand replaces it
     official = list(_official_parts(source, meshes, kept))
-    ours = list(_hand_parts())
-    decoration = [*_decoration_parts(source, meshes), *_eyeball_parts()]
+    hand_parts = list(_hand_parts())
+    unmoved = [*_unmoved_parts(source, meshes), *_eyeball_parts()]
     seen = [_simplified(part, EYE_FACES) for part in official if part.link in EYE_LINKS]
-    sets: dict[Look, list[_Part]] = {
-        "eye": seen + [_simplified(part, EYE_HAND_FACES) for part in ours],
-        "outside": official + decoration + ours,
+    sets: dict[SetName, list[_Part]] = {
+        "eye": seen + [_simplified(part, EYE_HAND_FACES) for part in hand_parts],
+        "outside": official + unmoved + hand_parts,
     }
-    listing = {look: _write_set(folder / look, parts) for look, parts in sets.items()}
+    listing = {name: _write_set(folder / name, parts) for name, parts in sets.items()}
     (folder / MANIFEST).write_text(json.dumps(listing, indent=1))
 
 
-def read_visuals(folder: Path, look: Look) -> tuple[Visual, ...]:
-    """One of the sets that `write_visuals` wrote."""
+def read_visuals(folder: Path, name: SetName) -> tuple[Visual, ...]:
+    """Read one of the sets that `write_visuals` wrote."""
     listing = json.loads((folder / MANIFEST).read_text())
     return tuple(
-        Visual(entry["link"], folder / look / entry["mesh"], tuple(entry["colour"]))
-        for entry in listing[look]
+        Visual(entry["link"], folder / name / entry["mesh"], tuple(entry["colour"]))
+        for entry in listing[name]
     )
 
 
@@ -125,7 +140,7 @@ def mesh_files(source: Tree, meshes: Path) -> list[Path]:
 
 
 def _write_set(folder: Path, parts: Iterable[_Part]) -> list[dict[str, object]]:
-    """Write one mesh for each link and colour."""
+    """Write one mesh for each link and colour into a new folder, and list them."""
     folder.mkdir()
     groups: dict[tuple[str, Colour], list[trimesh.Trimesh]] = {}
     for part in parts:
@@ -157,16 +172,16 @@ def _official_colour(link: str, rgba: str) -> Colour:
     return _COVERS if rgba.startswith(_OFFICIAL_RED) else _BODY
 
 
-def _decoration_parts(source: Tree, meshes: Path) -> Iterator[_Part]:
-    """The left arm and the legs, standing still, as parts of the root link."""
-    links = [name for name in source.links if name.startswith(_DECORATION)]
+def _unmoved_parts(source: Tree, meshes: Path) -> Iterator[_Part]:
+    """The left arm and the legs, as parts of the root link."""
+    links = [name for name in source.links if name.startswith(_UNMOVED_PREFIXES)]
     for part in _official_parts(source, meshes, links):
         part.mesh.apply_transform(source.pose(part.link, STANDING_POSTURE_DEG))
         yield _Part("root_link", part.mesh, part.colour)
 
 
 def _eyeball_parts() -> Iterator[_Part]:
-    """Eyes for the official head, which has none."""
+    """Eyeballs; the official head has none."""
     for x in (-0.034, 0.034):
         yield _Part("head", _ball(0.016, (x, 0.099, 0.057)), _EYEBALL)
         yield _Part("head", _ball(0.008, (x, 0.097, 0.067)), _SHELL)
@@ -183,17 +198,17 @@ def _simplified(part: _Part, faces: int) -> _Part:
 
 
 def _shaded(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The mesh with vertices doubled along its creases."""
+    """The mesh, its vertices doubled along sharp edges so that they are drawn sharp."""
     shaded: trimesh.Trimesh = trimesh.graph.smooth_shade(mesh, angle=np.deg2rad(CREASE_DEG))
     return shaded
 
 
 def _hand_parts() -> Iterator[_Part]:
-    """Palm, knuckles and phalanges in the look of the iCub's black and metal hand."""
+    """Palm, knuckles and phalanges in black and metal, like the iCub's own hand."""
     yield from _palm_parts()
     parents = {phalanx.parent for phalanx in hand.PHALANGES}
     for phalanx in hand.PHALANGES:
-        link = phalanx.joint.removesuffix("_joint")
+        link = phalanx.link
         yield _Part(link, _knuckle(phalanx.axis), _METAL)
         if link.endswith("_0"):
             yield _Part(link, _bone(phalanx.length_m, 0.0055, 0.0055), _METAL)
@@ -240,7 +255,7 @@ def _cylinder(
 
 
 def _bone(length_m: float, start_radius_m: float, end_radius_m: float) -> trimesh.Trimesh:
-    """A capsule along x from the origin, tapered."""
+    """A capsule along x from the origin, with a radius at each end."""
     start = _ball(start_radius_m, (0.0, 0.0, 0.0))
     end = _ball(end_radius_m, (length_m, 0.0, 0.0))
     return _hull(np.vstack([start.vertices, end.vertices]))

@@ -1,4 +1,4 @@
-"""Reading and writing the few parts of URDF that building the robot needs."""
+"""Reads and writes the parts of URDF that building the robot needs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,11 @@ Matrix = NDArray[np.float64]
 
 
 def find(element: ET.Element, tag: str) -> ET.Element:
-    """The child with a tag; ValueError if there is none."""
+    """The child element with a tag.
+
+    Raises:
+        ValueError: there is none.
+    """
     found = element.find(tag)
     if found is None:
         raise ValueError(f"{element.tag} {element.get('name')!r} has no <{tag}>")
@@ -22,14 +26,14 @@ def find(element: ET.Element, tag: str) -> ET.Element:
 
 
 class Tree:
-    """The links and joints of a URDF by name."""
+    """The links of a URDF by name, and the joints that connect them."""
 
     def __init__(self, robot: ET.Element) -> None:
         self.links = {link.get("name", ""): link for link in robot.iterfind("link")}
         self._joint_of = {child_of(joint): joint for joint in robot.iterfind("joint")}
 
     def chain(self, link: str) -> list[ET.Element]:
-        """Joints from the root to a link."""
+        """The joints from the root to a link, in this order."""
         joints: list[ET.Element] = []
         while link in self._joint_of:
             joints.insert(0, self._joint_of[link])
@@ -37,7 +41,7 @@ class Tree:
         return joints
 
     def pose(self, link: str, angles_deg: Mapping[str, float] | None = None) -> Matrix:
-        """Pose (4, 4) of a link in the root frame, joints at zero but for those named."""
+        """Pose (4, 4) of a link in the root frame; joints not in `angles_deg` are at zero."""
         pose = np.eye(4)
         for joint in self.chain(link):
             pose = pose @ origin_pose(joint)
@@ -54,7 +58,7 @@ def child_of(joint: ET.Element) -> str:
 
 
 def origin_pose(element: ET.Element) -> Matrix:
-    """Pose (4, 4) of an element's <origin>."""
+    """Pose (4, 4) that an element's <origin> stands for."""
     origin = find(element, "origin")
     pose = np.eye(4)
     pose[:3, :3] = rotation_from_rpy(numbers(origin.get("rpy", "0 0 0")))
@@ -63,12 +67,12 @@ def origin_pose(element: ET.Element) -> Matrix:
 
 
 def origin(xyz: Iterable[float], rpy: Iterable[float] = (0.0, 0.0, 0.0)) -> ET.Element:
-    """An <origin> (m, radians)."""
+    """An <origin> element of a position (m) and roll, pitch, yaw (radians)."""
     return ET.Element("origin", xyz=text(xyz), rpy=text(rpy))
 
 
 def inertial(mass_kg: float, inertia_kgm2: float, centre_m: Vector = (0.0, 0.0, 0.0)) -> ET.Element:
-    """An <inertial> with the same moment of inertia about every axis."""
+    """An <inertial> element with the same moment of inertia about every axis."""
     element = ET.Element("inertial")
     element.append(origin(centre_m))
     ET.SubElement(element, "mass", value=repr(mass_kg))
@@ -78,18 +82,18 @@ def inertial(mass_kg: float, inertia_kgm2: float, centre_m: Vector = (0.0, 0.0, 
 
 
 def limit(lower_deg: float, upper_deg: float) -> ET.Element:
-    """A <limit>; the simulator, not the URDF, bounds torque and speed."""
+    """A <limit> element; the drives, not the URDF, limit torque and speed."""
     lower, upper = repr(math.radians(lower_deg)), repr(math.radians(upper_deg))
     return ET.Element("limit", lower=lower, upper=upper, effort="100", velocity="100")
 
 
 def text(values: Iterable[float]) -> str:
-    """Numbers as an attribute."""
+    """Numbers in the form of an attribute."""
     return " ".join(repr(float(value)) for value in values)
 
 
 def numbers(attribute: str) -> tuple[float, ...]:
-    """Numbers of an attribute."""
+    """The numbers in an attribute."""
     return tuple(float(word) for word in attribute.split())
 
 

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import settings
+from outcomes import IMPRECISE
 
+from actors.tasks.experiment1.world import SUBTASKS
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
-from proto.episode import Episode, Kind, Outcome, Reason
+from proto.episode import Episode, Kind
 from proto.messages import EpisodeFailed
 
 # how long an example takes says more of what else the machine does than of the code
@@ -33,7 +35,7 @@ def make_episode() -> Callable[..., Episode]:
             id="0123456789abcdef",
             kind=Kind.TUTORING,
             task="experiment1",
-            situation={"object_y": 0.25, "object_yaw": -22.5, "obstacle_x": -0.27},
+            situation={"obstacle_x_m": -0.27, "object_y_m": 0.25, "object_yaw_deg": -22.5},
             seed=3001,
             actor="local",
             backend="sapien",
@@ -44,10 +46,11 @@ def make_episode() -> Callable[..., Episode]:
             actions=walk(steps, ACTION_SIZE),
             targets=walk(steps, ACTION_SIZE),
             joints_deg=walk(steps, len(JOINT_NAMES)),
-            phases=np.linspace(1, 8, steps).astype(np.uint8),
+            phase_names=tuple(SUBTASKS),
+            phases=np.linspace(0, 7, steps).astype(np.uint8),
             body_names=("object", "obstacle"),
             body_poses=walk(steps, 2, 7),
-            outcome=Outcome(True, True, False, Reason.IMPRECISE, 0.1, 1, 2, 11, 4, 5, 80, -1),
+            outcome=IMPRECISE,
             outputs=random.random((steps, 110), dtype=np.float32),
         )
         return replace(episode, **given)

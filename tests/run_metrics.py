@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from proto.episode import Kind, Reason
+from proto.episode import Kind
 from proto.metrics import (
     ActorMetrics,
     EvaluatorMetrics,
@@ -18,7 +18,7 @@ from services.trials.success import wilson95
 RUN = "watched"
 ACTOR = ActorMetrics(
     id="a-1", time_s=1.0, refused=0, policy_version=3, steps_per_s=81.25, episodes=17,
-    last_outcome=Reason.MOVED_OBJECT, last_kind=Kind.TRIAL, backend="sapien", outbox=2,
+    last_outcome="moved_object", last_kind=Kind.TRIAL, backend="sapien", outbox=2,
     put_aside=0, failed=0, paused=False,
 )  # fmt: skip
 LEARNER = LearnerMetrics(

@@ -7,8 +7,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.tasks.contract import Situation
 from proto.episode import Floats, Image, States
+from proto.variables import Situation
 
 
 class Policy(Protocol):

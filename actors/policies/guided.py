@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.policies.contract import Policy
-from actors.tasks.contract import Situation
 from proto.body import ACTION_SIZE, FOCUS, GRASP
 from proto.episode import Floats, Image
+from proto.variables import Situation
 
 Array = NDArray[np.float64]
 

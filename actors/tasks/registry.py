@@ -1,15 +1,39 @@
-"""Tasks by name."""
+"""Tasks by name: the built-in ones, and those of one's own as `package.module:Class`."""
 
 from __future__ import annotations
 
-from actors.tasks.contract import Task
-from actors.tasks.experiment1.reaching import Reaching
-from actors.tasks.experiment1.task import Experiment1
-from proto.config import TaskConfig
+from collections.abc import Mapping
+from typing import Final
 
-TASKS = {task.name: task for task in (Experiment1, Reaching)}
+from actors.tasks.contract import Task
+from proto.config import Config, TaskConfig
+from proto.extensions import check_attributes, load_class
+
+TASKS: Final[Mapping[str, str]] = {
+    "experiment1": "actors.tasks.experiment1.task:Experiment1",
+    "reaching": "actors.tasks.experiment1.reaching:Reaching",
+    "experiment2": "actors.tasks.experiment2.task:Experiment2",
+}
+_METHODS: Final = ("tutored", "sample", "check", "corners", "scene", "plan", "judge")
+_ATTRIBUTES: Final = (
+    *("variables", "subtasks", "start", "questions", "baselines", "figure_words"),
+    *("phases", "phase_names", "attention"),
+)
+
+
+def make_pretraining_task(config: Config) -> Task:
+    """The task whose sequences pre-training learns from."""
+    return make_task(config.task_called(config.pretraining_task or config.task.name))
 
 
 def make_task(config: TaskConfig) -> Task:
-    """Make the task that the configuration names."""
-    return TASKS[config.name](config.attention)
+    """Make the task that the section `task` of a configuration names.
+
+    Raises:
+        UserError: there is no such task, its class lacks something, or an option is unknown.
+    """
+    made = load_class("task.name", config.name, TASKS, _METHODS)
+    made.name = config.name  # recordings carry it, so that the task is found again
+    task: Task = made(config)
+    check_attributes("task.name", config.name, task, _ATTRIBUTES)
+    return task

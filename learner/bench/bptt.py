@@ -1,4 +1,4 @@
-"""How fast training is on this machine, side by side with other ways to do the same."""
+"""Speed of training on this machine, beside other ways to compute the same."""
 
 from __future__ import annotations
 
@@ -17,22 +17,25 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from learner.bench.reference import Step, plain_divergence, plain_outputs, plain_step
+from learner.bench.reference import Step, step_levels, stepwise_divergence, stepwise_outputs
 from learner.kernels.library import peak_flops
 from learner.network.mstnn import activation
 from learner.network.vmdnn import VMDNN
 from learner.training.adam import Adam
 from learner.training.divergence import add_gradients, reference_divergence
-from learner.training.loss import kl_divergence
-from learner.training.sequences import Sequences
+from learner.training.sequences import Minibatch, Sequences
+from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import Config, NetworkConfig
 from proto.machine import machine_name
 
 Epoch = Callable[[], object]
 
 MEASURING_S: Final = 12.0
+"""How long all contenders together are measured."""
 TURN_S: Final = 0.1
+"""How long a contender is measured before it is the next one's turn."""
 LONG_S: Final = 2.0
+"""A first epoch that takes longer is counted: what is done only once then matters little."""
 RATE: Final = 1e-4
 COMPILING_S: Final = 20.0
 """How long `torch.compile` may take, measuring included."""
@@ -44,9 +47,9 @@ class VisionSpeed:
 
     Attributes:
         batch: sequences at once.
-        step_by_step_ms: time when the steps are done one after the other.
-        batched_ms: time when all steps are convolved at once, as pre-training does.
-        ratio: the one over the other.
+        step_by_step_ms: time when the steps are computed one after the other.
+        batched_ms: time when all steps are convolved at once, as in pre-training.
+        ratio: step_by_step_ms over batched_ms.
     """
 
     batch: int
@@ -57,27 +60,27 @@ class VisionSpeed:
 
 @dataclass(frozen=True)
 class BpttSpeed:
-    """What `bench_bptt` measured: medians.
+    """Result of `bench_bptt`; times are medians.
 
     One epoch is the loss of all sequences in one minibatch, its gradients, and a step of Adam. The
-    activity of V_S is known, as in coupled training.
+    activity of V_S is given, as in coupled training.
 
     Attributes:
         machine: processor and number of cores.
         threads: threads of every contender.
         batch: number of sequences.
         steps: their length.
-        eager_ms: one epoch, PyTorch's autograd through a loop over the steps.
-        fused_ms: one epoch, as training does it.
-        ratio: the one over the other.
-        peers: one epoch of other ways: `torch.compile` of the step of that loop (None if it does
-            not compile in time), autograd by hand in PyTorch (what is used where nothing can be
-            compiled), and two other networks with as many weights: `nn.LSTM`, and an MTRNN looped
-            over a cell.
+        eager_ms: one epoch with PyTorch's autograd through a loop over the steps.
+        fused_ms: one epoch as in training.
+        ratio: eager_ms over fused_ms.
+        peers: one epoch of each other way (ms): `torch.compile` of the step of that loop (None if
+            it does not compile in time), gradients written by hand in PyTorch (used where nothing
+            can be compiled), and two other networks with as many weights: `nn.LSTM`, and an MTRNN
+            whose steps are a loop in Python.
         gflops: floating point operations that the epoch needs, in 10^9 per second.
-        peak_gflops: the same for multiply-adds on registers alone, all threads, in the same run.
-        fraction: the one over the other.
-        vision: the vision, which only pre-training trains.
+        peak_gflops: the same for multiply-adds on registers alone, with all threads.
+        fraction: gflops over peak_gflops.
+        vision: speed of the vision, which only pre-training trains.
     """
 
     machine: str
@@ -100,14 +103,15 @@ def bench_bptt(config: Config, *, batch: int, steps: int, threads: int) -> BpttS
     compiled_ms = _in_time(_compiled_ms, config.network, batch, steps, threads)
     network = _network(config.network)
     sequences = _sequences(network, batch, steps)
-    by_loop = functools.partial(plain_divergence, network, sequences)
-    by_hand = functools.partial(reference_divergence, network, sequences)
+    minibatch = Minibatch.of_all(sequences)
+    by_loop = functools.partial(stepwise_divergence, network, minibatch)
+    by_hand = functools.partial(reference_divergence, network, minibatch)
     contenders = {
-        "eager": _epoch(by_loop, network.core_parameters(), sequences),
-        "fused": _fused_epoch(_network(config.network), sequences),
-        "autograd by hand": _epoch(by_hand, network.core_parameters(), sequences),
-        "nn.LSTM": _peer_epoch(_Lstm, network, sequences),
-        "MTRNN cell": _peer_epoch(_Mtrnn, network, sequences),
+        "eager": _epoch(by_loop, network.core_parameters()),
+        "fused": _fused_epoch(_network(config.network), minibatch),
+        "autograd by hand": _epoch(by_hand, network.core_parameters()),
+        "nn.LSTM": _peer_epoch(_Lstm, network, minibatch),
+        "MTRNN cell": _peer_epoch(_Mtrnn, network, minibatch),
     }
     peaks = [_peak_flops(threads)]
     times = _medians_ms(contenders, MEASURING_S)
@@ -133,9 +137,9 @@ def bench_bptt(config: Config, *, batch: int, steps: int, threads: int) -> BpttS
 def operations(network: VMDNN) -> int:
     """Floating point operations that one step of one sequence needs, forward and backward.
 
-    Each weight takes part in a multiply-add for the activity, for its own gradient, and, but where
-    the activity below is not trained, for the gradient of that activity. What each unit needs
-    besides is not counted.
+    Each weight costs a multiply-add for the activity, one for its own gradient, and one for the
+    gradient of the activity below unless that is fixed (V_S). Operations on single units, such as
+    tanh, are not counted.
     """
     weights = sum(each.numel() for each in network.core_parameters() if each.dim() > 1)
     return 2 * (3 * weights - network.pfc.input.numel())
@@ -148,39 +152,32 @@ def _network(config: NetworkConfig) -> VMDNN:
 
 
 def _sequences(network: VMDNN, batch: int, steps: int) -> Sequences:
-    """Any will do: what they show makes no difference to the time."""
+    """Random sequences; their content makes no difference to the time."""
     generator = torch.Generator().manual_seed(2)
     seen = torch.randn(batch, steps, network.pfc.input.shape[1], generator=generator)
     codes = torch.randn(batch, steps, *network.outputs.shape, generator=generator).softmax(-1)
     return Sequences.stacked(list(seen), list(codes))
 
 
-def _fused_epoch(network: VMDNN, sequences: Sequences) -> Epoch:
-    """As training does it, if all sequences fit into one minibatch."""
-    parameters = network.core_parameters()
-    adam = Adam(parameters)
-    everything = torch.arange(len(sequences.mask))
+def _fused_epoch(network: VMDNN, minibatch: Minibatch) -> Epoch:
+    """An epoch as in training."""
+    adam = Adam(network.core_parameters())
 
     def epoch() -> float:
-        loss = add_gradients(network, sequences, everything)
+        loss = add_gradients(network, minibatch)
         adam.step(RATE)
         return loss
 
     return epoch
 
 
-def _epoch(
-    loss: Callable[[Tensor], Tensor],
-    parameters: Sequence[nn.Parameter],
-    sequences: Sequences,
-) -> Epoch:
-    """The same by autograd and PyTorch's fused Adam."""
+def _epoch(loss: Callable[[], Tensor], parameters: Sequence[nn.Parameter]) -> Epoch:
+    """An epoch with autograd and PyTorch's fused Adam."""
     adam = torch.optim.Adam(parameters, RATE, fused=True)
-    everything = torch.arange(len(sequences.mask))
 
     def epoch() -> float:
         adam.zero_grad()
-        value = loss(everything)
+        value = loss()
         value.backward()  # type: ignore[no-untyped-call]
         with _one_thread():
             adam.step()
@@ -193,8 +190,8 @@ def _epoch(
 def _one_thread() -> Iterator[None]:
     """Let PyTorch compute in one thread.
 
-    A step of Adam on so few weights takes less time than threads take to meet; where others use the
-    cores too, it is a thousand times as long.
+    A step of Adam on so few weights takes less time than starting and joining threads. Where other
+    processes use the cores too, threads would make it a thousand times slower.
     """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -205,17 +202,17 @@ def _one_thread() -> Iterator[None]:
 
 
 def _medians_ms(contenders: Mapping[str, Epoch], limit_s: float) -> dict[str, float]:
-    """The contenders take turns, so that all meet the same machine."""
+    """Median time of each contender; they take turns, so that all run under the same load."""
     times = {name: _warm_up(epoch) for name, epoch in contenders.items()}
     end = time.perf_counter() + limit_s
     while time.perf_counter() < end or not all(times.values()):
         for name, epoch in contenders.items():
             times[name] += _turn(epoch)
-    return {name: 1e3 * median(laps) for name, laps in times.items()}
+    return {name: 1e3 * median(durations) for name, durations in times.items()}
 
 
 def _warm_up(epoch: Epoch) -> list[float]:
-    """Its time, where it is so long that what is done only once matters little."""
+    """Run a first epoch; its time if it is a long one, else nothing."""
     start = time.perf_counter()
     epoch()
     taken = time.perf_counter() - start
@@ -223,16 +220,16 @@ def _warm_up(epoch: Epoch) -> list[float]:
 
 
 def _turn(epoch: Epoch) -> list[float]:
-    laps: list[float] = []
-    while not laps or sum(laps) < TURN_S:
+    durations: list[float] = []
+    while not durations or sum(durations) < TURN_S:
         start = time.perf_counter()
         epoch()
-        laps.append(time.perf_counter() - start)
-    return laps
+        durations.append(time.perf_counter() - start)
+    return durations
 
 
 def _peak_flops(threads: int) -> float:
-    """The best of some short bursts."""
+    """The highest rate of some short measurements."""
     return max(peak_flops(threads) for _ in range(20))
 
 
@@ -240,7 +237,7 @@ def _peak_flops(threads: int) -> float:
 
 
 def _in_time(measure: Callable[..., float], *arguments: Any) -> float | None:
-    """What `measure` returns, or None if it fails or takes too long; in a process of its own."""
+    """Result of `measure` in a process of its own, or None if it fails or takes too long."""
     context = multiprocessing.get_context("spawn")
     receiving, sending = context.Pipe(duplex=False)
     process = context.Process(target=_send, args=(sending, measure, arguments), daemon=True)
@@ -256,22 +253,24 @@ def _in_time(measure: Callable[..., float], *arguments: Any) -> float | None:
 
 
 def _send(sending: Connection, measure: Callable[..., float], arguments: Sequence[Any]) -> None:
-    os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # no further processes
+    os.environ["TORCHINDUCTOR_COMPILE_THREADS"] = "1"  # start no further processes
     sending.send(measure(*arguments))
 
 
 def _compiled_ms(config: NetworkConfig, batch: int, steps: int, threads: int) -> float:
-    """The loop of "eager" with its step compiled: the whole loop does not compile in minutes."""
+    """One epoch of the loop of "eager" with its step compiled.
+
+    The whole loop takes minutes to compile.
+    """
     torch.set_num_threads(threads)
     network = _network(config)
-    sequences = _sequences(network, batch, steps)
-    step: Step = torch.compile(plain_step, dynamic=False)
+    minibatch = Minibatch.of_all(_sequences(network, batch, steps))
+    step: Step = torch.compile(step_levels, dynamic=False)
 
-    def loss(chosen: Tensor) -> Tensor:
-        outputs = plain_outputs(network, sequences.seen[chosen], step=step)
-        return kl_divergence(outputs, sequences.codes[chosen], sequences.mask[chosen])
+    def loss() -> Tensor:
+        return minibatch.divergence(stepwise_outputs(network, minibatch.seen(), step=step))
 
-    epoch = _epoch(loss, network.core_parameters(), sequences)
+    epoch = _epoch(loss, network.core_parameters())
     return _medians_ms({"compiled": epoch}, limit_s=1.0)["compiled"]
 
 
@@ -293,11 +292,12 @@ class _Lstm(nn.Module):
 
 
 class _Mtrnn(nn.Module):
-    """V_S > fast context <> slow context, fast context > M_O, as robot learning libraries have it.
+    """V_S > fast context <> slow context, fast context > M_O, as in robot learning libraries.
 
-    Continuous-time recurrent network with two time constants (Yamashita and Tani 2008): the fast
-    units get the input, themselves and the slow ones; the slow units get themselves and the fast
-    ones. A cell computes a step from its linear layers, and a loop in Python calls it.
+    A continuous-time recurrent network with two time constants (Yamashita and Tani 2008). The fast
+    units get the input, their own activity and that of the slow units; the slow units get their own
+    activity and that of the fast units. A cell of linear layers computes a step, and a loop in
+    Python calls it.
     """
 
     fast_tau, slow_tau, slow_units = 5.0, 50.0, 20
@@ -334,9 +334,9 @@ class _Mtrnn(nn.Module):
 
 
 def _peer_epoch(
-    kind: Callable[[int, int, int], nn.Module], network: VMDNN, sequences: Sequences
+    kind: Callable[[int, int, int], nn.Module], network: VMDNN, minibatch: Minibatch
 ) -> Epoch:
-    """An epoch of another network, with as many units as give at least as many parameters."""
+    """An epoch of another network with the fewest units that give at least as many parameters."""
     inputs, outputs = network.pfc.input.shape[1], len(network.outputs.bias)
     wanted = sum(each.numel() for each in network.core_parameters())
     units = 1
@@ -344,12 +344,11 @@ def _peer_epoch(
         units += 1
     peer = kind(inputs, units, outputs)
 
-    def loss(chosen: Tensor) -> Tensor:
-        potentials = peer(sequences.seen[chosen])
-        log_outputs = functional.log_softmax(potentials.unflatten(-1, network.outputs.shape), -1)
-        return kl_divergence(log_outputs, sequences.codes[chosen], sequences.mask[chosen])
+    def loss() -> Tensor:
+        potentials = peer(minibatch.seen()).unflatten(-1, network.outputs.shape)
+        return minibatch.divergence(functional.log_softmax(potentials, -1))
 
-    return _epoch(loss, list(peer.parameters()), sequences)
+    return _epoch(loss, list(peer.parameters()))
 
 
 # --- vision ---
@@ -358,12 +357,11 @@ def _peer_epoch(
 def _bench_vision(config: Config, steps: int) -> VisionSpeed:
     network = _network(config.network)
     batch = config.learner.pretraining.batch
-    width, height = config.network.image
     generator = torch.Generator().manual_seed(3)
-    images = 2 * torch.rand(batch, steps, height, width, generator=generator) - 1
+    images = 2 * torch.rand(batch, steps, IMAGE_HEIGHT, IMAGE_WIDTH, generator=generator) - 1
     wanted = torch.randn(network.see(images[:1, :1]).shape[-1], generator=generator)
 
-    def lap(see: Callable[[Tensor], Tensor]) -> Epoch:
+    def epoch_of(see: Callable[[Tensor], Tensor]) -> Epoch:
         def forward_and_backward() -> None:
             network.zero_grad()
             (see(images) @ wanted).mean().backward()  # type: ignore[no-untyped-call]
@@ -371,7 +369,10 @@ def _bench_vision(config: Config, steps: int) -> VisionSpeed:
         return forward_and_backward
 
     times = _medians_ms(
-        {"steps": lap(functools.partial(_see_step_by_step, network)), "batched": lap(network.see)},
+        {
+            "steps": epoch_of(functools.partial(_see_step_by_step, network)),
+            "batched": epoch_of(network.see),
+        },
         MEASURING_S / 2,
     )
     return VisionSpeed(
@@ -383,7 +384,7 @@ def _bench_vision(config: Config, steps: int) -> VisionSpeed:
 
 
 def _see_step_by_step(network: VMDNN, images: Tensor) -> Tensor:
-    """`VMDNN.see` as eq. (3) and (4) read."""
+    """`VMDNN.see`, step by step, as eq. (3) and (4) are printed."""
     potentials: list[Tensor | float] = [0.0, 0.0]
     seen = []
     for now in images.unbind(1):

@@ -1,6 +1,6 @@
-"""The recurrent core as its equations read: one step after the other, with PyTorch's own autograd.
+"""The recurrent core as its equations read: step by step, differentiated by PyTorch's autograd.
 
-Slow. It is what the kernels are tested against and what `vmdnn bench bptt` compares them with.
+It is slow. Tests and `vmdnn bench bptt` compare the kernels with it; nothing else uses it.
 """
 
 from __future__ import annotations
@@ -14,12 +14,11 @@ from torch.nn import functional
 
 from learner.network.mstnn import activation
 from learner.network.vmdnn import VMDNN
-from learner.training.loss import kl_divergence
-from learner.training.sequences import Sequences
+from learner.training.sequences import Minibatch
 
 
 class State(NamedTuple):
-    """What goes from step to step, for PFC, M_S and M_F; each (B, units)."""
+    """State of PFC, M_S and M_F between two steps; each tensor is (B, units)."""
 
     potentials: tuple[Tensor, ...]
     activities: tuple[Tensor, ...]
@@ -28,23 +27,19 @@ class State(NamedTuple):
 Step = Callable[[VMDNN, Tensor, State], State]
 
 
-def plain_divergence(
-    network: VMDNN,
-    sequences: Sequences,
-    chosen: Tensor,
-    initial: Tensor | None = None,
-    shift: Tensor | None = None,
-) -> Tensor:
+def stepwise_divergence(network: VMDNN, minibatch: Minibatch) -> Tensor:
     """`learner.training.divergence.divergence`, step by step."""
-    seen = sequences.seen[chosen]
-    if shift is not None:
-        seen = seen + shift[:, None]
-    log_outputs = plain_outputs(network, seen, initial)
-    return kl_divergence(log_outputs, sequences.codes[chosen], sequences.mask[chosen])
+    return minibatch.divergence(stepwise_outputs(network, minibatch.seen(), minibatch.initial))
 
 
-def plain_step(network: VMDNN, below: Tensor, state: State) -> State:
-    """One step: eq. (1) and (2). `below` is V_S, of the step before if the order is literal."""
+def step_levels(network: VMDNN, below: Tensor, state: State) -> State:
+    """One step of eq. (1) and (2).
+
+    Args:
+        network: the network.
+        below: (B, units) activity of V_S; that of the step before if the update order is literal.
+        state: state before the step.
+    """
     literal = network.config.update_order == "literal"
     before = state.activities
     potentials, activities = [], []
@@ -60,10 +55,10 @@ def plain_step(network: VMDNN, below: Tensor, state: State) -> State:
     return State(tuple(potentials), tuple(activities))
 
 
-def plain_outputs(
-    network: VMDNN, seen: Tensor, initial: Tensor | None = None, step: Step = plain_step
+def stepwise_outputs(
+    network: VMDNN, seen: Tensor, initial: Tensor | None = None, step: Step = step_levels
 ) -> Tensor:
-    """`VMDNN.act`, step by step."""
+    """`VMDNN.act`, step by step; `step` computes one step of the levels."""
     literal = network.config.update_order == "literal"
     units = [level.units for level in network.levels()]
     if initial is None:
@@ -73,8 +68,8 @@ def plain_outputs(
     before = torch.zeros_like(seen[:, 0])
     outputs = []
     for now in seen.unbind(1):
-        shown = state.activities[-1]
+        fast_before = state.activities[-1]
         state = step(network, before if literal else now, state)
         before = now
-        outputs.append(network.outputs(shown if literal else state.activities[-1]))
+        outputs.append(network.outputs(fast_before if literal else state.activities[-1]))
     return torch.stack(outputs, dim=1)

@@ -1,10 +1,10 @@
-// VMDNN one step at a time, for acting: a picture in, the outputs of M_O out.
+// VMDNN one step at a time, for acting: from an image to the outputs of M_O.
 //
-// `learner.stepping` says the same in numpy; `learner.kernels.acting` calls this.
+// `learner.network.numpy_network` computes the same in numpy; `learner.kernels.acting` calls this.
 //
-// A vector holds neighbouring units: of one row of V_F or V_S, or of a level. What the units of a
-// row see through one weight of a strided kernel lies `stride` numbers apart, so the columns of
-// what is below are sorted by their remainder first, and then lie side by side.
+// A vector holds neighbouring units of one row of V_F or V_S, or of a level. The inputs of a row of
+// units through one weight of a strided kernel lie `stride` values apart. So the columns of the
+// subnet below are first sorted by their remainder; then these inputs lie side by side.
 
 #include <algorithm>
 #include <cstddef>
@@ -21,9 +21,9 @@ namespace {
 
 typedef Vector<float> Vec;
 constexpr int kLanes = Simd<float>::kLanes;
-constexpr int kMaps = 3;  // maps of which a row is summed at once, so that sums stay in registers
+constexpr int kMaps = 3;  // maps of which a row is computed at once; their sums fit in registers
 
-// What `learner.kernels.acting` says of the network.
+// Description of a network, which `learner.kernels.acting` fills in.
 
 struct MapsShape {
   std::int32_t maps, height, width, kernel_height, kernel_width, stride;
@@ -40,8 +40,8 @@ struct Description {
   MapsShape maps[2];      // V_F, V_S
   LevelShape levels[3];   // PFC, M_S, M_F
   std::int32_t values, softmax_units;
-  std::int32_t literal;   // the update order of eq. (1)
-  const float* parameters;  // one after the other, as in `learner.subnets.parameter_shapes`
+  std::int32_t literal;   // the update order in which eq. (1) is printed
+  const float* parameters;  // one after the other, ordered as `learner.kernels.acting` says
 };
 
 constexpr int rounded_up(int count, int unit) { return (count + unit - 1) / unit * unit; }
@@ -87,7 +87,7 @@ class Maps {
         width_below_(width_below),
         pitch_((width_below + shape.stride - 1) / shape.stride),
         taps_(maps_below * shape.kernel_height * shape.kernel_width),
-        // rows are read in whole vectors, the last ones beyond their ends
+        // rows are read in whole vectors, beyond their ends
         below_(std::ptrdiff_t(shape.stride) * rows_below_ * pitch_ + 2 * kLanes),
         potentials_(std::ptrdiff_t(shape.maps) * shape.height * whole_vectors(shape.width)) {
     for (int map = 0; map < maps_below; ++map) {
@@ -132,7 +132,7 @@ class Maps {
     }
   }
 
-  // below_ becomes (stride, rows, pitch): column x is number x / stride of its remainder.
+  // Fills below_ (stride, rows, pitch): column x becomes column x / stride of its remainder.
   void sort_columns(const float* below) {
     for (int row = 0; row < rows_below_; ++row, below += width_below_) {
       for (int phase = 0; phase < shape_.stride; ++phase) {
@@ -142,7 +142,7 @@ class Maps {
     }
   }
 
-  // kMaps maps from `map` on, kVectors vectors of their row `row` from column `column` on.
+  // Computes kVectors vectors of row `row`, from `column` on, of kMaps maps, from `map` on.
   template <int kVectors>
   void part_of_row(int map, int row, int column, int pitch, float* activity) {
     Vec sums[kMaps][kVectors];
@@ -173,7 +173,7 @@ class Maps {
   int rows_below_, width_below_;
   int pitch_;  // of below_
   int taps_;   // weights of one unit
-  std::vector<std::int32_t> offsets_;  // where in below_ each tap of the first unit is
+  std::vector<std::int32_t> offsets_;  // index in below_ of each tap of the first unit
   std::vector<float> weights_, biases_;
   std::vector<float> below_, potentials_;
 };
@@ -192,7 +192,7 @@ class Weights {
     }
   }
 
-  // What the vector of units from `unit` on gets from the activity of the sources.
+  // Input of the vector of units from `unit` on for this activity of the sources.
   Vec product(int unit, const float* activity) const {
     const float* weights = packed_.data() + unit;
     Vec sum{};
@@ -231,7 +231,7 @@ class Level {
   std::vector<float> biases_, potentials_;
 };
 
-// A softmax for each value over its units, in place; `potentials` has whole vectors.
+// Softmax for each value over its units, in place; `potentials` is padded to whole vectors.
 void softmax(float* potentials, int values, int units) {
   for (int value = 0; value < values; ++value) {
     float* own = potentials + value * units;
@@ -263,13 +263,13 @@ class Network {
     for (std::vector<float>& activity : before_) std::fill(activity.begin(), activity.end(), 0.0f);
   }
 
-  // The activity of V_S for the image that is seen now.
+  // Computes the activity of V_S for the image of this step.
   void see(const float* image, float* seen) {
     fast_.step(image, fast_activity_.data());
     slow_.step(fast_activity_.data(), seen);
   }
 
-  // The outputs (values, softmax units) for the activity of V_S now.
+  // Computes the outputs (values, softmax units) for the activity of V_S of this step.
   void act(const float* seen, float* outputs) {
     std::copy_n(seen, features(), now_[0].begin());
     const auto& source = literal_ ? before_ : now_;
@@ -312,7 +312,8 @@ class Network {
   Weights output_weights_;
   std::vector<float> output_biases_;
   std::vector<float> fast_activity_, potentials_;
-  // Activity of V_S, PFC, M_S, M_F and of nothing above it, one step before and now.
+  // Activity of V_S, PFC, M_S and M_F one step before and now; the fifth stays empty, since M_F has
+  // no level above.
   std::vector<float> before_[5], now_[5];
 };
 
@@ -320,7 +321,7 @@ class Network {
 
 extern "C" {
 
-// Null if there is no memory.
+// Returns null if there is no memory.
 Network* vmdnn_acting_new(const Description* description) {
   try {
     return new Network(*description);

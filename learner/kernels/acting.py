@@ -1,30 +1,22 @@
-"""The network that acts, compiled: one call of C++ for what it sees, one for what it does.
-
-It computes in float32 what `learner.network.numpy_network` says in numpy. See `acting.cpp` for how.
-"""
+"""The whole network one step at a time: one call of C++ to see, one to act (`acting.cpp`)."""
 
 from __future__ import annotations
 
 import ctypes
-import logging
 import weakref
-from collections.abc import Mapping
-from functools import cache, partial
-from math import prod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from learner.kernels.build import NotCompiledError, find_or_compile
-from learner.network.subnets import Subnet, parameter_shapes, subnets
-from proto.config import NetworkConfig
+from learner.kernels.library import acting_library
 
-Array = NDArray[np.floating]
 Floats = NDArray[np.float32]
 
-_LEVELS: Final = ("pfc", "mtrnn_slow", "mtrnn_fast")
-_log = logging.getLogger(__name__)
+_LEVELS: Final = 3
 
 
 class _MapsShape(ctypes.Structure):
@@ -49,89 +41,129 @@ class _Description(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("image_height", "image_width")),
         ("maps", _MapsShape * 2),
-        ("levels", _LevelShape * len(_LEVELS)),
+        ("levels", _LevelShape * _LEVELS),
         *((name, ctypes.c_int32) for name in ("values", "softmax_units", "literal")),
         ("parameters", ctypes.c_void_p),
     )
 
 
-def available() -> bool:
-    """Whether networks can be compiled ones here; says so once."""
-    return _library() is not None
+@dataclass(frozen=True)
+class MapsSizes:
+    """V_F or V_S.
 
-
-class CompiledNetwork:
-    """A network in C++ with the interface and, to float32, the numbers of `NumpyNetwork`.
-
-    Args:
-        config: the network's sizes.
-        parameters: arrays by name, shaped as `parameter_shapes(config)`.
-
-    Raises:
-        RuntimeError: it is not `available` here.
+    Attributes:
+        maps: number of maps.
+        height: rows of units in a map.
+        width: columns of units in a map.
+        kernel_height: rows of the subnet below that one unit sees.
+        kernel_width: columns of it.
+        stride: shift of the kernel between neighbouring units.
+        tau: time constant in control steps.
     """
 
-    def __init__(self, config: NetworkConfig, parameters: Mapping[str, Array]) -> None:
-        library = _library()
+    maps: int
+    height: int
+    width: int
+    kernel_height: int
+    kernel_width: int
+    stride: int
+    tau: float
+
+
+@dataclass(frozen=True)
+class LevelSizes:
+    """PFC, M_S or M_F: number of units, and time constant in control steps."""
+
+    units: int
+    tau: float
+
+
+@dataclass(frozen=True)
+class NetworkSizes:
+    """The whole network.
+
+    Attributes:
+        image: (height, width) of the image.
+        maps: V_F and V_S.
+        levels: PFC, M_S and M_F.
+        values: values of an action.
+        softmax_units: units of M_O for each value.
+        literal: every connection of the levels takes one step, as eq. (1) is printed.
+    """
+
+    image: tuple[int, int]
+    maps: tuple[MapsSizes, MapsSizes]
+    levels: tuple[LevelSizes, LevelSizes, LevelSizes]
+    values: int
+    softmax_units: int
+    literal: bool
+
+
+class ActingKernel:
+    """A network in C++ with its state.
+
+    `see` computes `seen` from `image`, and `act` computes `outputs` from `seen`; each starts from
+    the state after the call before. The caller writes and reads the three arrays in place.
+
+    Attributes:
+        image: (height, width) float32, brightness -1..1.
+        seen: (V_S units,) float32, activity of V_S.
+        outputs: (values, softmax units) float32.
+        reset: returns to the neutral state.
+        see: computes `seen`.
+        act: computes `outputs`.
+    """
+
+    def __init__(self, sizes: NetworkSizes, parameters: Sequence[Floats]) -> None:
+        """Make a network in its neutral state.
+
+        Args:
+            sizes: its sizes.
+            parameters: kernel and bias of V_F and V_S; input, recurrent, feedback (not of M_F) and
+                bias of each level; input and bias of the outputs. They are copied.
+
+        Raises:
+            RuntimeError: the library is not compiled here.
+            ValueError: the parameters do not have the sizes.
+            MemoryError: there is not enough memory.
+        """
+        library = acting_library()
         if library is None:
-            raise RuntimeError("there is no compiled library")
-        by_name = subnets(config)
-        network = _make(library, config, by_name, parameters)
+            raise RuntimeError("the kernels are not compiled here")
+        network = _make(library, sizes, parameters)
         weakref.finalize(self, library.vmdnn_acting_free, network)
-        _, height, width = by_name["vision_input"].shape
-        self._image = np.zeros((height, width), np.float32)
-        self._seen = np.zeros(prod(by_name["mstnn_slow"].shape), np.float32)
-        self._outputs = np.zeros(by_name["outputs"].shape, np.float32)
+        slow = sizes.maps[1]
+        self.image = np.zeros(sizes.image, np.float32)
+        self.seen = np.zeros(slow.maps * slow.height * slow.width, np.float32)
+        self.outputs = np.zeros((sizes.values, sizes.softmax_units), np.float32)
         image, seen, outputs = (
-            array.ctypes.data for array in (self._image, self._seen, self._outputs)
+            array.ctypes.data for array in (self.image, self.seen, self.outputs)
         )
-        self._reset = partial(library.vmdnn_acting_reset, network)
-        self._see = partial(library.vmdnn_acting_see, network, image, seen)
-        self._act = partial(library.vmdnn_acting_act, network, seen, outputs)
-
-    def reset(self) -> None:
-        """Return to the neutral state."""
-        self._reset()
-
-    def step(self, image: Array) -> Array:
-        """Outputs (11, softmax units) for the image (height, width) seen now, -1..1."""
-        np.copyto(self._image, image)
-        self._see()
-        self._act()
-        return self._outputs.copy()
-
-    def see(self, image: Array) -> Array:
-        """The first half of a step: activity (units,) of V_S."""
-        np.copyto(self._image, image)
-        self._see()
-        return self._seen.copy()
-
-    def act(self, seen: Array) -> Array:
-        """The second half: outputs for what `see` returned."""
-        np.copyto(self._seen, seen)
-        self._act()
-        return self._outputs.copy()
+        self.reset = partial(library.vmdnn_acting_reset, network)
+        self.see = partial(library.vmdnn_acting_see, network, image, seen)
+        self.act = partial(library.vmdnn_acting_act, network, seen, outputs)
 
 
-def _make(
-    library: ctypes.PyDLL,
-    config: NetworkConfig,
-    by_name: Mapping[str, Subnet],
-    parameters: Mapping[str, Array],
-) -> int:
+def available() -> bool:
+    """Whether the library is compiled here; logs which, once."""
+    return acting_library() is not None
+
+
+def _make(library: ctypes.PyDLL, sizes: NetworkSizes, parameters: Sequence[Floats]) -> int:
     """A new network of the library."""
-    _, height, width = by_name["vision_input"].shape
-    values, softmax_units = by_name["outputs"].shape
-    in_one_row = _in_one_row(config, parameters)
+    flat = np.concatenate([np.asarray(each, np.float32).reshape(-1) for each in parameters])
+    if len(flat) != _parameter_count(sizes):  # the library follows the sizes without checking them
+        raise ValueError(f"there are {len(flat)} parameters, not {_parameter_count(sizes)}")
+    height, width = sizes.image
     description = _Description(
         image_height=height,
         image_width=width,
-        maps=(_maps_shape(by_name["mstnn_fast"]), _maps_shape(by_name["mstnn_slow"])),
-        levels=tuple(_level_shape(by_name[name]) for name in _LEVELS),
-        values=values,
-        softmax_units=softmax_units,
-        literal=config.update_order == "literal",
-        parameters=in_one_row.ctypes.data,
+        maps=tuple(_maps_shape(maps) for maps in sizes.maps),
+        levels=tuple(_LevelShape(level.units, 1 / level.tau) for level in sizes.levels),
+        values=sizes.values,
+        softmax_units=sizes.softmax_units,
+        literal=sizes.literal,
+        parameters=flat.ctypes.data,
     )
     network: int | None = library.vmdnn_acting_new(ctypes.byref(description))
     if network is None:
@@ -139,42 +171,26 @@ def _make(
     return network
 
 
-def _maps_shape(subnet: Subnet) -> _MapsShape:
-    kernel_height, kernel_width = subnet.parameters["kernel"][2:]
-    return _MapsShape(*subnet.shape, kernel_height, kernel_width, subnet.stride, 1 / subnet.tau)
+def _maps_shape(maps: MapsSizes) -> _MapsShape:
+    return _MapsShape(
+        maps.maps,
+        maps.height,
+        maps.width,
+        maps.kernel_height,
+        maps.kernel_width,
+        maps.stride,
+        1 / maps.tau,
+    )
 
 
-def _level_shape(subnet: Subnet) -> _LevelShape:
-    return _LevelShape(*subnet.shape, 1 / subnet.tau)
-
-
-def _in_one_row(config: NetworkConfig, parameters: Mapping[str, Array]) -> Floats:
-    """All parameters, one after the other; the library follows the sizes without looking."""
-    row = []
-    for name, shape in parameter_shapes(config).items():
-        if parameters[name].shape != shape:
-            raise ValueError(f"{name} is {parameters[name].shape}, but must be {shape}")
-        row.append(np.asarray(parameters[name], np.float32).reshape(-1))
-    return np.concatenate(row)
-
-
-@cache
-def _library() -> ctypes.PyDLL | None:
-    """The compiled library, if there is one; says once whether.
-
-    Its calls are too short to let other threads run meanwhile: getting the turn back could take
-    longer than the call.
-    """
-    try:
-        path = find_or_compile()
-        library = ctypes.PyDLL(str(path))
-    except (NotCompiledError, OSError) as error:
-        _log.warning("acting: in numpy, several times slower than compiled: %s", error)
-        return None
-    _log.info("acting: compiled C++ (%s)", path)
-    pointer = ctypes.c_void_p
-    library.vmdnn_acting_new.restype = pointer
-    for name, arguments in (("free", 1), ("reset", 1), ("see", 3), ("act", 3)):
-        function = getattr(library, f"vmdnn_acting_{name}")
-        function.argtypes, function.restype = (pointer,) * arguments, None
-    return library
+def _parameter_count(sizes: NetworkSizes) -> int:
+    count, maps_below = 0, 1
+    for maps in sizes.maps:
+        count += maps.maps * (maps_below * maps.kernel_height * maps.kernel_width + 1)
+        maps_below = maps.maps
+    below = maps_below * sizes.maps[1].height * sizes.maps[1].width
+    for level, above in zip(sizes.levels, (*sizes.levels[1:], None), strict=True):
+        sources = below + level.units + (0 if above is None else above.units)
+        count += level.units * (sources + 1)
+        below = level.units
+    return count + sizes.values * sizes.softmax_units * (below + 1)

@@ -1,4 +1,4 @@
-// A step of Adam over all parameters at once. `learner.adam` says the same in PyTorch;
+// A step of Adam over all parameters at once. `learner.training.adam` defines the same in PyTorch;
 // `learner.kernels.adam` calls this.
 
 #include <algorithm>
@@ -31,11 +31,11 @@ double norm(const Real* values, std::int64_t count) {
 
 template <typename Real>
 void step(std::int64_t count, Real* __restrict__ weights, Real* __restrict__ gradient,
-          Real* __restrict__ means, Real* __restrict__ squares, std::int64_t steps, double rate,
-          double longest) {
-  const Real factor = Real(std::min(1.0, longest / (norm(gradient, count) + 1e-6)));
-  const Real mean_scale = Real(rate / (1 - std::pow(kMeanDecay, double(steps))));
-  const Real square_scale = Real(1 / (1 - std::pow(kSquareDecay, double(steps))));
+          Real* __restrict__ means, Real* __restrict__ squares, std::int64_t number, double rate,
+          double max_norm) {
+  const Real factor = Real(std::min(1.0, max_norm / (norm(gradient, count) + 1e-6)));
+  const Real mean_scale = Real(rate / (1 - std::pow(kMeanDecay, double(number))));
+  const Real square_scale = Real(1 / (1 - std::pow(kSquareDecay, double(number))));
   for (std::int64_t i = 0; i < count; ++i) {
     const Real slope = factor * gradient[i];
     means[i] += Real(1 - kMeanDecay) * (slope - means[i]);
@@ -49,16 +49,16 @@ void step(std::int64_t count, Real* __restrict__ weights, Real* __restrict__ gra
 
 extern "C" {
 
-// The step with this number, from 1 on. Arrays are of `count` values: weights; gradient, shortened
-// to a norm of `longest` and zero afterwards; its means and the means of its squares.
+// Does a step of Adam. All arrays have `count` values. A gradient with a norm above `max_norm` is
+// scaled down to it; the gradient is zero afterwards. `number` counts steps from 1 on.
 void vmdnn_adam_float(std::int64_t count, float* weights, float* gradient, float* means,
-                      float* squares, std::int64_t steps, double rate, double longest) {
-  step(count, weights, gradient, means, squares, steps, rate, longest);
+                      float* squares, std::int64_t number, double rate, double max_norm) {
+  step(count, weights, gradient, means, squares, number, rate, max_norm);
 }
 
 void vmdnn_adam_double(std::int64_t count, double* weights, double* gradient, double* means,
-                       double* squares, std::int64_t steps, double rate, double longest) {
-  step(count, weights, gradient, means, squares, steps, rate, longest);
+                       double* squares, std::int64_t number, double rate, double max_norm) {
+  step(count, weights, gradient, means, squares, number, rate, max_norm);
 }
 }
 

@@ -1,56 +1,61 @@
-"""A step of Adam on the CPU: one call of C++ for all parameters. See `adam.cpp`."""
+"""A step of Adam on the CPU: one call of C++ for all parameters (`adam.cpp`)."""
 
 from __future__ import annotations
 
 import ctypes
-import functools
-from typing import Any
+from dataclasses import dataclass
+from typing import Final
 
-import torch
 from torch import Tensor
 
-from learner.kernels.library import learning_library
+from learner.kernels.library import TypedKernel
+
+_KERNEL: Final = TypedKernel(
+    "vmdnn_adam",
+    (
+        ctypes.c_int64,
+        *[ctypes.c_void_p] * 4,
+        ctypes.c_int64,
+        ctypes.c_double,
+        ctypes.c_double,
+    ),
+)
+
+supports = _KERNEL.supports
 
 
-def serves(weights: Tensor) -> bool:
-    """Whether the kernel can compute on these weights, where and of what type they are."""
-    return weights.device.type == "cpu" and weights.dtype in _functions()
+@dataclass(frozen=True)
+class AdamArrays:
+    """What a step of Adam changes; all contiguous, on one device and of one type.
+
+    Attributes:
+        weights: (N,).
+        gradient: (N,) by the weights; zero after the step.
+        means: (N,) running means of the gradient.
+        squares: (N,) running means of its squares.
+    """
+
+    weights: Tensor
+    gradient: Tensor
+    means: Tensor
+    squares: Tensor
 
 
-def step(
-    weights: Tensor,
-    gradient: Tensor,
-    means: Tensor,
-    squares: Tensor,
-    *,
-    steps: int,
-    rate: float,
-    longest: float,
-) -> None:
-    """`learner.training.adam.reference_step`, computed by the kernel."""
-    _functions()[weights.dtype](
+def step(arrays: AdamArrays, *, number: int, rate: float, max_norm: float) -> None:
+    """Do a step of Adam, as `learner.training.adam.reference_step` defines it.
+
+    Args:
+        arrays: changed in place; `supports(arrays.weights)` must hold.
+        number: number of the step, from 1 on.
+        rate: learning rate.
+        max_norm: a gradient with a larger norm is scaled down to it; may be infinite.
+    """
+    weights = arrays.weights
+    _KERNEL(
+        weights.dtype,
         len(weights),
-        *(array.data_ptr() for array in (weights, gradient, means, squares)),
-        steps,
+        *(array.data_ptr() for array in vars(arrays).values()),
+        number,
         rate,
-        longest,
+        max_norm,
     )
-
-
-@functools.cache
-def _functions() -> dict[torch.dtype, Any]:
-    """The kernel by type, none where it cannot be compiled."""
-    library = learning_library()
-    if library is None:
-        return {}
-    functions = {torch.float32: library.vmdnn_adam_float, torch.float64: library.vmdnn_adam_double}
-    for function in functions.values():
-        function.restype = None
-        function.argtypes = (
-            ctypes.c_int64,
-            *[ctypes.c_void_p] * 4,
-            ctypes.c_int64,
-            ctypes.c_double,
-            ctypes.c_double,
-        )
-    return functions

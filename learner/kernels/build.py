@@ -1,8 +1,8 @@
-"""Compile the C++ kernels, one library, with the machine's own compiler.
+"""Compile the C++ kernels into one library, with the machine's own compiler.
 
-The library is compiled when the package is installed, else at its first use. Its name holds a
-digest of the sources, the flags and the processor, so that what was compiled for another processor
-or from older sources is never loaded.
+The library is compiled when the package is installed, otherwise at its first use. Its name holds a
+digest of the sources, the flags and the processor, so that a library for another processor or of
+older sources is never loaded.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
+from proto.cache import cache_folder
+
 FOLDER: Final = Path(__file__).parent
 SOURCES: Final = ("core.cpp", "adam.cpp", "mixing.cpp", "maps.cpp", "acting.cpp")
-HEADERS: Final = ("vectors.h", "lanes.h")
+HEADERS: Final = ("vectors.h", "lanes.h", "threads.h")
 FLAGS: Final = (
     "-std=c++17",
     "-O3",
@@ -33,7 +35,7 @@ _COMPILERS: Final = ("c++", "g++", "clang++")
 
 
 class NotCompiledError(Exception):
-    """There is no library, for the reason that the message gives."""
+    """There is no library; the message gives the reason."""
 
 
 def find_or_compile() -> Path:
@@ -49,11 +51,6 @@ def find_or_compile() -> Path:
     return compile_into(cache_folder())
 
 
-def cache_folder() -> Path:
-    """`$VMDNN_CACHE`, or `~/.cache/vmdnn`."""
-    return Path(os.environ.get("VMDNN_CACHE") or Path.home() / ".cache" / "vmdnn")
-
-
 def library_name() -> str:
     """File name of the library for these sources and this processor."""
     texts = ((FOLDER / name).read_text() for name in (*SOURCES, *HEADERS))
@@ -62,7 +59,7 @@ def library_name() -> str:
 
 
 def compile_into(folder: Path) -> Path:
-    """Compile the library into a folder, where it appears only when it is whole.
+    """Compile the library into a folder; the file appears there only when it is complete.
 
     Raises:
         NotCompiledError: there is no compiler, or it failed.
@@ -91,7 +88,7 @@ def _compiler() -> str:
 
 
 def _processor() -> str:
-    """What -march=native depends on."""
+    """Description of the processor, on which -march=native depends."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:

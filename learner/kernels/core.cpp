@@ -1,22 +1,22 @@
 // The recurrent core PFC > M_S > M_F > M_O, forward and backward through whole sequences.
 //
-// Given the activity of V_S and the teacher's outputs, one call computes the Kullback-Leibler
-// divergence of eq. (5) and its gradients: those of the paper's eq. (6), with the paths inside a
-// step added. `learner.mtrnn` and `learner.vmdnn` say the same in PyTorch; `learner.kernels.cpu`
-// calls this.
+// One call computes, from the activity of V_S and the teacher's outputs, the Kullback-Leibler
+// divergence of eq. (5) and its gradients: those of the paper's eq. (6), plus the paths within a
+// step. `learner.training.divergence` defines the same in PyTorch; `learner.kernels.core` calls
+// this.
 //
-// How it is fast:
-// - Sequences are grouped, one sequence a vector lane. An array "of vectors" below holds one value
-//   of each sequence of a group. Products of weights and states then need no sums across lanes,
-//   and only the connections that exist are computed.
+// Why it is fast:
+// - Sequences are grouped, with one sequence in each vector lane. An array of vectors holds one
+//   value of each sequence of a group. Products of weights and states then need no sums across
+//   lanes, and only the connections that exist are computed.
 // - Every product sums a tile of results in registers.
-// - Only the two scans are bound to the order of steps. All else is cut into chunks of steps that
-//   threads share, and a chunk's intermediate results stay in cache.
-// - Each piece of work writes sums of its own, added up in a fixed order at the end. So results do
-//   not depend on which thread did what.
+// - Only the two scans depend on the order of the steps. All other work is divided into chunks of
+//   steps, which the threads share. Intermediate results of a chunk stay in the cache.
+// - Each chunk writes its own sums, which are added in a fixed order at the end. So the results do
+//   not depend on the threads.
 //
-// With h = tanh(v), v = slope u and y = gain h a step needs no factors: gain, slope and 1 / tau go
-// into the packed weights, and into the gradients at the end.
+// With h = tanh(v), v = slope u and y = gain h, a step needs no factors: the packed weights, and at
+// the end the gradients, are multiplied by gain, slope and 1 / tau.
 
 #include <algorithm>
 #include <atomic>
@@ -26,18 +26,19 @@
 #include <mutex>
 #include <new>
 #include <numeric>
-#include <thread>
+#include <thread>  // std::this_thread::yield
 #include <vector>
 
 #include "lanes.h"
+#include "threads.h"
 
 namespace vmdnn {
 namespace {
 
-constexpr int kTile = 10;   // results of a product in registers; units are padded to a multiple
+constexpr int kTile = 10;   // results of a product in registers; units are padded to its multiples
 constexpr int kSide = 5;    // a tile of a weight gradient is kSide x kSide
 constexpr int kWide = 3;    // vectors of inputs in a tile of the gradient of the input weights
-constexpr int kChunk = 32;  // steps that are worked on together where their order does not matter
+constexpr int kChunk = 32;  // steps of a chunk
 
 // ---------------------------------------------------------------------------------------------
 // Products
@@ -95,8 +96,8 @@ void add_totals(const Vector<Real>* vectors, int pitch, int rows, int steps, Rea
   }
 }
 
-// sums[i][f] += sum over steps of left[step][i] right[step][f], where a vector holds neighbouring f.
-// kVectors of them are done, for kSide values of i.
+// sums[i][f] += sum over steps of left[step][i] right[step][f], for kSide values of i and kVectors
+// vectors of neighbouring f.
 template <typename Real, int kVectors>
 inline void add_rank_products(const Real* left, int left_pitch, const Real* right, int pitch,
                               int steps, Real* sums) {
@@ -129,15 +130,15 @@ inline void add_rank_products(const Real* left, int left_pitch, const Real* righ
 }
 
 // ---------------------------------------------------------------------------------------------
-// What is asked for
+// The problem
 
 template <typename Real>
-struct Problem {
+struct CoreProblem {
   std::int32_t levels;         // PFC, M_S, M_F
   std::int32_t inputs;         // units of V_S
   std::int32_t values;         // of an action
   std::int32_t softmax_units;  // of each value
-  std::int32_t literal;        // whether every connection takes a step, as in eq. (1)
+  std::int32_t literal;        // whether every connection takes one step, as eq. (1) is printed
   std::int32_t sequences;      // B
   std::int32_t steps;          // T
   std::int32_t threads;
@@ -145,18 +146,19 @@ struct Problem {
   const double* leaks;           // (levels,) 1 / tau
   const std::int64_t* chosen;    // (B,) which of the S sequences
   const Real* seen;              // (S, T, inputs)
-  const Real* targets;           // (S, T, values * softmax units), each value's sum is one
-  const Real* target_entropies;  // (S, T) sum of targets * log(targets)
-  const Real* mask;              // (S, T)
+  const Real* codes;           // (S, T, values * softmax units), the teacher's outputs
+  const Real* code_entropies;  // (S, T) sum of codes * log(codes)
+  const Real* mask;            // (S, T) one where a sequence has a step
   const Real* initial;           // (B, all units) potentials before the first step; null: zero
-  const Real* shift;             // (B, inputs) added to what is seen at every step, or null
-  // Of each level: input, recurrent, feedback (but the last), bias; of the outputs: input, bias.
+  const Real* shift;           // (B, inputs) added to `seen` at every step, or null
+  // Of each level input, recurrent, feedback (but the last level) and bias; of the outputs input
+  // and bias.
   const Real* const* parameters;
   double* divergence;
-  Real* const* by_parameters;  // is added to; null: only the divergence is asked for
-  Real* by_drive;              // (B, T, units of the PFC) by what V_S brings to the PFC, or null
+  Real* const* by_parameters;  // gradients are added to these; null: compute no gradients
+  Real* by_drive;              // (B, T, units of the PFC) by the input from V_S, or null
   Real* by_initial;            // (B, all units), or null
-  Real* by_shift;              // (B, units of the PFC) by what the shift brings there, or null
+  Real* by_shift;              // (B, units of the PFC) by the input from the shift, or null
 };
 
 struct Level {
@@ -170,8 +172,8 @@ struct Level {
 
 inline int padded_to_tiles(int units) { return (units + kTile - 1) / kTile * kTile; }
 
-// scale times a (rows x columns) matrix of the given pitches, in tiles of kTile rows: tile by tile,
-// column by column, filled up with zeros to whole tiles and `padded` columns.
+// Packs scale times a (rows x columns) matrix with these pitches into tiles of kTile rows: tile by
+// tile, column by column, padded with zeros to whole tiles and `padded` columns.
 template <typename Real>
 void pack(Real* packed, const Real* matrix, int row_pitch, int column_pitch, int rows, int columns,
           int padded, Real scale) {
@@ -187,7 +189,7 @@ void pack(Real* packed, const Real* matrix, int row_pitch, int column_pitch, int
   }
 }
 
-// to (rows x columns) += scale times a matrix with this pitch.
+// to += scale times a (rows x columns) matrix with this pitch; `to` has no padding.
 template <typename Real>
 void add_scaled(const Real* matrix, int pitch, int rows, int columns, Real scale, Real* to) {
   for (int row = 0; row < rows; ++row, matrix += pitch, to += columns) {
@@ -200,10 +202,10 @@ template <typename Real>
 struct Connection {
   int to;
   int from;
-  bool delayed;         // whether it takes a step
-  int parameter;        // which of the parameters its (to.units, from.units) weights are
-  std::ptrdiff_t sums;  // where its gradient lies among a group's sums, with padded sizes
-  Real scale;           // packed over given weights
+  bool delayed;         // whether it takes one step
+  int parameter;        // index of its (to.units, from.units) weights among the parameters
+  std::ptrdiff_t sums;  // index of its gradient, with padded sizes, in the sums of a group
+  Real scale;           // factor of the packed weights
   Real* forward;        // packed, rows `to`
   Real* backward;       // packed, rows `from`
 };
@@ -213,29 +215,29 @@ enum Stage { kProject, kForward, kOutputs, kBackward, kInputs, kDone };
 template <typename Real>
 class Pass {
  public:
-  Pass(const Problem<Real>& problem, Arena& arena);
+  Pass(const CoreProblem<Real>& problem, Arena& arena);
   void run();
 
  private:
   using Vec = Vector<Real>;
   static constexpr int kLanes = Simd<Real>::kLanes;
 
-  // kLanes sequences and what is computed of them. Row t + 1 of hidden and deltas is step t, row 0
-  // is the state before the first step.
+  // kLanes sequences and their arrays. Row t + 1 of hidden and deltas is step t, row 0 the state
+  // before the first step.
   struct Group {
-    int members;
-    int steps;                // of the longest
-    int member[kLanes];       // which of the B
-    std::int64_t row[kLanes];  // first of its T rows among the S * T; lanes left over repeat one
+    int members;               // number of sequences; unused lanes repeat the last one
+    int steps;                 // of the longest sequence
+    int member[kLanes];        // index in the minibatch
+    std::int64_t row[kLanes];  // index of the first step among the S * T steps
     Vec* hidden;              // (steps + 1, width)
-    Vec* deltas;              // (steps + 2, width) by v; first by h of M_F
-    Real* sums;               // gradients of what the backward scan does
+    Vec* deltas;              // (steps + 2, width) gradient by v; at first by h of M_F
+    Real* sums;               // gradients that the backward scan sums
     Real* output_sums;        // (chunks, ...)
     Real* input_sums;         // (chunks, ...)
     double* divergences;      // (chunks,)
     Stage stage;
-    int next;        // chunk of this stage that is not yet taken
-    int unfinished;  // chunks of this stage
+    int next;        // first chunk of this stage that no thread has taken
+    int unfinished;  // chunks of this stage that are not finished
   };
 
   struct Scratch {
@@ -295,18 +297,18 @@ class Pass {
                            Real* sums) const;
   void add_up() const;
 
-  const Problem<Real>& problem_;
-  const int lag_;      // steps that an input connection takes
+  const CoreProblem<Real>& problem_;
+  const int lag_;      // steps that the connection from V_S takes
   const int outputs_;  // units of M_O, padded
   int width_ = 0;      // units of all levels, padded
   int units_ = 0;      // units of all levels
   std::vector<Level> levels_;
-  std::vector<int> biases_;                    // of the levels: which of the parameters
+  std::vector<int> biases_;                    // indices of the levels' biases in the parameters
   std::vector<Connection<Real>> connections_;  // between levels
   Connection<Real> to_outputs_{};
-  int output_bias_ = 0;            // which of the parameters
-  std::ptrdiff_t group_sums_ = 0;  // gradients of the connections, then of the levels' biases
-  double weight_ = 0;              // of one value of one step in the mean
+  int output_bias_ = 0;            // index in the parameters
+  std::ptrdiff_t group_sums_ = 0;  // size of a group's sums: connections, then biases of the levels
+  double weight_ = 0;              // weight of one value of one step in the mean
   std::vector<Group> groups_;
   std::vector<Scratch> scratch_;
   Real* packed_bias_ = nullptr;         // (width,)
@@ -315,10 +317,10 @@ class Pass {
   std::mutex mutex_;
 };
 
-// --- what there is to do ---
+// --- description of the problem ---
 
 template <typename Real>
-Pass<Real>::Pass(const Problem<Real>& problem, Arena& arena)
+Pass<Real>::Pass(const CoreProblem<Real>& problem, Arena& arena)
     : problem_(problem),
       lag_(problem.literal ? 1 : 0),
       outputs_(padded_to_tiles(problem.values * problem.softmax_units)) {
@@ -367,7 +369,7 @@ void Pass<Real>::connect(int to, int from, bool delayed, int parameter) {
   group_sums_ += std::ptrdiff_t(levels_[to].padded) * levels_[from].padded;
 }
 
-// Sequences of like length go together, the longest first.
+// Groups sequences of similar length, the longest first.
 template <typename Real>
 void Pass<Real>::form_groups() {
   const int count = problem_.sequences;
@@ -464,16 +466,11 @@ void Pass<Real>::pack_connection(Connection<Real>& connection, int to, int to_pa
   pack(connection.backward, weights, 1, from.units, from.units, to, to_padded, connection.scale);
 }
 
-// --- who does it ---
+// --- distribution over threads ---
 
 template <typename Real>
 void Pass<Real>::run() {
-  std::vector<std::thread> helpers;
-  for (int i = 1; i < problem_.threads; ++i) {
-    helpers.emplace_back([this, i] { work(scratch_[i]); });
-  }
-  work(scratch_[0]);
-  for (std::thread& helper : helpers) helper.join();
+  run_in_threads(problem_.threads, [this](int thread) { work(scratch_[thread]); });
   add_up();
 }
 
@@ -493,9 +490,9 @@ void Pass<Real>::work(const Scratch& scratch) {
   }
 }
 
-// The next piece of work, or false when all is done. Only one thread at a time can scan a group, so
-// that scans come first and the groups keep about level: else the last one would be scanned alone.
-// Not too many are begun, for the cache's sake.
+// Takes the next piece of work; returns false when all work is done. Only one thread at a time can
+// scan a group. So scans come first, which keeps the groups at about the same stage; otherwise the
+// other threads would wait for the last group. Few groups are begun, so that they fit in the cache.
 template <typename Real>
 bool Pass<Real>::claim(Task& task) {
   const int most_begun = problem_.threads == 1 ? 1 : problem_.threads + 1;
@@ -530,7 +527,7 @@ void Pass<Real>::finish(const Task& task) {
 
 // --- forward ---
 
-// What the PFC gets from V_S, and its biases, into its rows of `hidden`.
+// Writes the input of the PFC from V_S, with its biases, into the rows of `hidden`.
 template <typename Real>
 void Pass<Real>::project(const Group& group, int chunk, const Scratch& scratch) const {
   const Level& pfc = levels_.front();
@@ -560,7 +557,7 @@ void Pass<Real>::project(const Group& group, int chunk, const Scratch& scratch) 
   }
 }
 
-// What the PFC gets from the shift of V_S, at every step.
+// The input of the PFC from the shift of V_S, the same at every step.
 template <typename Real>
 void Pass<Real>::project_shift(const Group& group, const Scratch& scratch, Vec* drive) const {
   const Level& pfc = levels_.front();
@@ -614,7 +611,7 @@ void Pass<Real>::scan_forward(Group& group, const Scratch& scratch) const {
   }
 }
 
-// The state before the first step, and the rows of `deltas` that nothing else writes.
+// Sets the state before the first step, and the rows of `deltas` that nothing else writes.
 template <typename Real>
 void Pass<Real>::start_rows(Group& group, Vec* potentials) const {
   for (int i = 0; i < width_; ++i) potentials[i] = Vec{};
@@ -632,12 +629,12 @@ void Pass<Real>::start_rows(Group& group, Vec* potentials) const {
   for (int i = 0; i < width_; ++i) group.hidden[i] = tanh_of(potentials[i]);
   if (!wants_gradients()) return;
   Vec* unseen = group.deltas + (lag_ == 0 ? 0 : std::ptrdiff_t(group.steps) * width_);
-  std::fill(unseen, unseen + width_, Vec{});  // no output sees this row
+  std::fill(unseen, unseen + width_, Vec{});  // no output depends on this row
   Vec* after = group.deltas + std::ptrdiff_t(group.steps + 1) * width_;
   std::fill(after, after + width_, Vec{});
 }
 
-// Softmax, divergence and, for eq. (6), the deltas of M_O and what they mean to M_F.
+// Softmax, divergence, and for eq. (6) the deltas of M_O and their contribution to those of M_F.
 template <typename Real>
 void Pass<Real>::outputs(const Group& group, int chunk, const Scratch& scratch) const {
   const Level& fast = levels_.back();
@@ -662,10 +659,10 @@ void Pass<Real>::outputs(const Group& group, int chunk, const Scratch& scratch) 
     double entropies = 0;
     for (int lane = 0; lane < kLanes; ++lane) {
       const std::int64_t at = group.row[lane] + t;
-      arrays[lane] = problem_.targets + at * outputs;
+      arrays[lane] = problem_.codes + at * outputs;
       if (lane < group.members) {
         mask[lane] = problem_.mask[at];
-        entropies += double(problem_.mask[at]) * double(problem_.target_entropies[at]);
+        entropies += double(problem_.mask[at]) * double(problem_.code_entropies[at]);
       }
     }
     gather(arrays, outputs, scratch.targets);
@@ -742,7 +739,7 @@ void Pass<Real>::scan_backward(Group& group) const {
   if (problem_.by_shift != nullptr) give_shift(group);
 }
 
-// deltas[row] = dE/dv: eq. (6), with the paths inside a step added.
+// deltas[row] = dE/dv: eq. (6), plus the paths within a step.
 template <typename Real>
 void Pass<Real>::step_backward(Group& group, int row) const {
   Vec* now = group.deltas + std::ptrdiff_t(row) * width_;
@@ -750,12 +747,12 @@ void Pass<Real>::step_backward(Group& group, int row) const {
   const Vec* hidden = group.hidden + std::ptrdiff_t(row) * width_;
   for (int l = int(levels_.size()) - 1; l >= 0; --l) {
     const Level& level = levels_[l];
-    const bool shown = l + 1 == int(levels_.size());  // to M_O, which left what it wants here
+    const bool last = l + 1 == int(levels_.size());  // `outputs` left its contribution here
     for (int tile = 0; tile < level.padded; tile += kTile) {
       const int first = level.start + tile;
       Vec sums[kTile];
 #pragma GCC unroll 10
-      for (int i = 0; i < kTile; ++i) sums[i] = shown ? now[first + i] : Vec{};
+      for (int i = 0; i < kTile; ++i) sums[i] = last ? now[first + i] : Vec{};
       for (const Connection<Real>& connection : connections_) {
         if (connection.from != l || (row == 0 && !connection.delayed)) continue;
         const Level& to = levels_[connection.to];
@@ -771,7 +768,7 @@ void Pass<Real>::step_backward(Group& group, int row) const {
   }
 }
 
-// Adds what the rows first..end - 1 give to the gradients of connections and biases.
+// Adds the contribution of the rows first..end - 1 to the gradients of connections and biases.
 template <typename Real>
 void Pass<Real>::sum_gradients(const Group& group, int first, int end) const {
   const Vec* deltas = group.deltas + std::ptrdiff_t(first) * width_;
@@ -825,7 +822,7 @@ void Pass<Real>::give_shift(const Group& group) const {
   }
 }
 
-// The sum of the deltas of a unit of the PFC, over all steps that see something.
+// The sum of the deltas of a unit of the PFC over all steps with input from V_S.
 template <typename Real>
 Vector<Real> Pass<Real>::total_delta(const Group& group, int unit) const {
   const Vec* deltas = group.deltas + levels_.front().start + unit;
@@ -836,7 +833,8 @@ Vector<Real> Pass<Real>::total_delta(const Group& group, int unit) const {
   return total;
 }
 
-// The gradient of the weights from V_S, whose activity is read as it lies: units side by side.
+// The gradient of the weights from V_S. Its activity is read where it lies, with neighbouring units
+// side by side.
 template <typename Real>
 void Pass<Real>::inputs(const Group& group, int chunk, const Scratch& scratch) const {
   const Level& pfc = levels_.front();
@@ -863,7 +861,7 @@ void Pass<Real>::inputs(const Group& group, int chunk, const Scratch& scratch) c
   if (chunk == 0 && problem_.shift != nullptr) add_shift_gradients(group, scratch, sums);
 }
 
-// What the shift adds to that: it is seen at every step, so that the sums of the deltas will do.
+// The contribution of the shift. It is the same at every step, so the sums of the deltas suffice.
 template <typename Real>
 void Pass<Real>::add_shift_gradients(const Group& group, const Scratch& scratch,
                                      Real* sums) const {
@@ -878,8 +876,8 @@ void Pass<Real>::add_shift_gradients(const Group& group, const Scratch& scratch,
   }
 }
 
-// sums[i][f] += sum over some steps of one sequence of deltas[step][i] seen[step][f]; fetches what
-// is seen `soon`.
+// sums[i][f] += sum over some steps of one sequence of deltas[step][i] seen[step][f]; prefetches
+// `soon`, which is read next.
 template <typename Real>
 void Pass<Real>::add_input_gradients(const Real* deltas, const Real* seen, int steps,
                                      const Real* soon, Real* sums) const {
@@ -913,9 +911,9 @@ void Pass<Real>::add_input_gradients(const Real* deltas, const Real* seen, int s
   }
 }
 
-// --- the end ---
+// --- sums over all groups ---
 
-// Adds up what all pieces of work have summed, in an order that does not depend on the threads.
+// Adds the sums of all groups and chunks in an order that does not depend on the threads.
 template <typename Real>
 void Pass<Real>::add_up() const {
   double divergence = 0;
@@ -953,7 +951,7 @@ void Pass<Real>::add_up() const {
 }
 
 template <typename Real>
-int compute(const Problem<Real>* problem) {
+int compute(const CoreProblem<Real>* problem) {
   static thread_local Arena arena;
   try {
     Pass<Real>(*problem, arena).run();
@@ -963,13 +961,12 @@ int compute(const Problem<Real>* problem) {
   return 0;
 }
 
-// Floating point operations that one thread does in `rounds` rounds of multiply-adds, which depend
-// on nothing but registers.
+// Does `rounds` rounds of multiply-adds on registers alone; returns the floating point operations.
 double multiply_add(long rounds) {
   constexpr int kChains = 16;  // enough to fill the pipelines of two units
   Vector<float> sums[kChains] = {};
   Vector<float> factor = Vector<float>{} + 0.999f;
-  asm volatile("" : "+m"(factor));  // not known when compiling
+  asm volatile("" : "+m"(factor));  // unknown to the compiler
   const Vector<float> x = factor;
   for (long round = 0; round < rounds; ++round) {
 #pragma GCC unroll 16
@@ -985,26 +982,22 @@ double multiply_add(long rounds) {
 
 extern "C" {
 
-// The machine's peak: floating point operations per second of `threads` threads.
+// The peak of the machine with `threads` threads: floating point operations per second.
 double vmdnn_peak_flops(int threads) {
   const auto start = std::chrono::steady_clock::now();
   std::atomic<double> operations{0};
-  std::vector<std::thread> helpers;
-  for (int i = 0; i < threads; ++i) {
-    helpers.emplace_back([&operations] {
-      const double done = multiply_add(2000000);
-      for (double sum = operations; !operations.compare_exchange_weak(sum, sum + done);) {
-      }
-    });
-  }
-  for (std::thread& helper : helpers) helper.join();
+  run_in_threads(threads, [&operations](int) {
+    const double done = multiply_add(2000000);
+    for (double sum = operations; !operations.compare_exchange_weak(sum, sum + done);) {
+    }
+  });
   const std::chrono::duration<double> taken = std::chrono::steady_clock::now() - start;
   return operations / taken.count();
 }
 
-int vmdnn_core_float(const Problem<float>* problem) { return compute(problem); }
+int vmdnn_core_float(const CoreProblem<float>* problem) { return compute(problem); }
 
-int vmdnn_core_double(const Problem<double>* problem) { return compute(problem); }
+int vmdnn_core_double(const CoreProblem<double>* problem) { return compute(problem); }
 }
 
 }  // namespace vmdnn

@@ -1,4 +1,4 @@
-// Arrays with one member a lane, made from and into arrays that lie one after the other.
+// Conversion between vectors with one array in each lane and arrays that lie one after the other.
 
 #pragma once
 
@@ -49,7 +49,7 @@ inline void transpose(Vector<Real>* square) {
   transpose_from<Real, 1>(square);
 }
 
-// Lane i of the result is the sum of the lanes of vector i. The vectors are used up.
+// Lane i of the result is the sum of the lanes of vector i. The vectors are overwritten.
 template <typename Real, int kStep = 1>
 inline Vector<Real> sums_of_lanes(Vector<Real>* square) {
   constexpr int kLanes = Simd<Real>::kLanes;
@@ -65,7 +65,7 @@ inline Vector<Real> sums_of_lanes(Vector<Real>* square) {
   }
 }
 
-// Arrays of `count` values, one array a lane, as an array of `count` vectors.
+// Reads kLanes arrays of `count` values into `count` vectors, one array in each lane.
 template <typename Real>
 inline void gather(const Real* const* arrays, int count, Vector<Real>* vectors) {
   constexpr int kLanes = Simd<Real>::kLanes;
@@ -76,7 +76,7 @@ inline void gather(const Real* const* arrays, int count, Vector<Real>* vectors) 
     return;
   }
   for (int next = 0; next < count; next += kLanes) {
-    const int start = std::min(next, count - kLanes);  // the last block may overlap the one before
+    const int start = std::min(next, count - kLanes);  // the last block may overlap the previous
     Vector<Real> square[kLanes];
 #pragma GCC unroll 16
     for (int lane = 0; lane < kLanes; ++lane) square[lane] = load(arrays[lane] + start);
@@ -86,7 +86,7 @@ inline void gather(const Real* const* arrays, int count, Vector<Real>* vectors) 
   }
 }
 
-// The converse, for the first `members` arrays.
+// Writes the first `members` lanes of `count` vectors to arrays.
 template <typename Real>
 inline void scatter(const Vector<Real>* vectors, int count, Real* const* arrays, int members) {
   constexpr int kLanes = Simd<Real>::kLanes;
@@ -106,16 +106,16 @@ inline void scatter(const Vector<Real>* vectors, int count, Real* const* arrays,
   }
 }
 
-// Memory that a thread keeps from call to call: fresh pages would cost more than the arithmetic.
+// Memory that a thread keeps from call to call; new pages would cost more than the arithmetic.
 
 class Arena {
  public:
   ~Arena() { std::free(memory_); }
 
-  // From here until `reserve`, what `take` gives is only counted.
+  // Starts counting: until `reserve`, `take` returns no usable memory but adds up the sizes.
   void measure() { used_ = 0; }
 
-  // From here on `take` gives what was counted, and all that was taken before is lost.
+  // Provides the memory that was counted; earlier results of `take` become invalid.
   void reserve() {
     const std::size_t bytes = used_;
     used_ = 0;

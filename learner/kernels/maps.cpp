@@ -1,29 +1,29 @@
 // One subnet of feature maps (V_F, V_S) over whole sequences, forward and backward.
 //
-// `learner.mstnn` says the same in PyTorch; `learner.kernels.maps` calls this.
+// `learner.network.mstnn` defines the same in PyTorch; `learner.kernels.maps` calls this.
 //
-// A subnet's drive depends on the subnet below at the same step only, so that any frames can be
-// convolved together: a vector holds one number of several frames, and a tile of neighbouring
-// units of several maps is summed in registers. The leak then runs over the steps, a vector
-// holding neighbouring units. Each group of frames sums gradients of its own, added up in a fixed
-// order, so that results do not depend on the threads.
+// A subnet's drive depends on the subnet below at the same step only, so frames of any steps and
+// sequences can be convolved together: a vector holds one value of several frames, and a tile of
+// neighbouring units of several maps is summed in registers. The leaky integration over the steps
+// follows; there a vector holds neighbouring units. Each group of frames sums its own gradients,
+// which are added in a fixed order, so that the results do not depend on the threads.
 
 #include <algorithm>
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
-#include <thread>
 #include <vector>
 
 #include "lanes.h"
+#include "threads.h"
 
 namespace vmdnn {
 namespace {
 
-constexpr int kMapsAtOnce = 3;   // of a tile
-constexpr int kUnitsAtOnce = 8;  // of a tile, side by side
-constexpr int kRowsAtOnce = 6;   // whose activity stays in the cache for the gradient of a kernel
-constexpr int kSegment = 512;    // units that leak together
+constexpr int kMapsAtOnce = 3;   // maps of a tile
+constexpr int kUnitsAtOnce = 8;  // neighbouring units of a tile
+constexpr int kRowsAtOnce = 6;   // rows whose activity stays in the cache for a kernel's gradient
+constexpr int kSegment = 512;    // units that are integrated together
 
 template <typename Real>
 struct MapsProblem {
@@ -37,8 +37,8 @@ struct MapsProblem {
   const Real* kernel;         // (maps, maps below, kernel height, kernel width)
   const Real* bias;           // (maps,)
   Real* activity;             // (B, T, maps, height, width)
-  const Real* by_activity;    // from here on for the backward pass only
-  Real* by_drive;             // of the shape of activity
+  const Real* by_activity;    // this and all below: for the backward pass only
+  Real* by_drive;             // shaped as activity
   Real* by_kernel;
   Real* by_bias;
   Real* by_below;             // or null
@@ -57,17 +57,12 @@ struct Shape {
 template <typename Function>
 void share(int count, int threads, Function function) {
   std::atomic<int> next{0};
-  const auto work = [&](int thread) {
+  run_in_threads(std::min(threads, count), [&](int thread) {
     for (int index = next++; index < count; index = next++) function(index, thread);
-  };
-  std::vector<std::thread> helpers;
-  for (int thread = 1; thread < std::min(threads, count); ++thread) helpers.emplace_back(work, thread);
-  work(0);
-  for (std::thread& helper : helpers) helper.join();
+  });
 }
 
-// Calls function with the sizes of tiles that make up `count`, as integral constants, and where
-// each tile begins.
+// Divides `count` into tiles; calls function(size, begin) for each, with size an integral constant.
 template <int kLargest, typename Function>
 inline void tiles(int count, Function function, int begin = 0) {
   while (count - begin >= kLargest) {
@@ -80,7 +75,7 @@ inline void tiles(int count, Function function, int begin = 0) {
   }
 }
 
-// Weights element(map, channel, row, column) in the order in which `convolve` reads them.
+// Packs weights element(map, channel, row, column) in the order in which `convolve` reads them.
 template <typename Real, typename Element>
 void pack(const Shape& shape, Real* packed, Element element) {
   tiles<kMapsAtOnce>(shape.maps, [&](auto maps, int map) {
@@ -94,7 +89,7 @@ void pack(const Shape& shape, Real* packed, Element element) {
   });
 }
 
-// kMaps maps of kUnits neighbouring units.
+// Adds the convolution for kUnits neighbouring units of kMaps maps to sums.
 template <typename Real, int kMaps, int kUnits>
 inline void convolve_tile(const Shape& shape, const Vector<Real>* x, const Real* weights,
                           Vector<Real> (&sums)[kMaps][kUnits]) {
@@ -113,7 +108,7 @@ inline void convolve_tile(const Shape& shape, const Vector<Real>* x, const Real*
   }
 }
 
-// put(map, row, column, vector) takes the results; they begin with begin(map).
+// Convolves; sums start from begin(map), and put(map, row, column, vector) takes each result.
 template <typename Real, typename Begin, typename Put>
 void convolve(const Shape& shape, const Vector<Real>* x, const Real* packed, Begin begin, Put put) {
   tiles<kMapsAtOnce>(shape.maps, [&](auto maps, int map) {
@@ -136,8 +131,8 @@ void convolve(const Shape& shape, const Vector<Real>* x, const Real* packed, Beg
   });
 }
 
-// Adds to by_kernel (maps, channels, kernel height, kernel width) what the deltas (maps, rows,
-// columns) give.
+// Adds the gradient by the kernel (maps, channels, kernel height, kernel width) for the deltas
+// (maps, rows, columns) to by_kernel.
 template <typename Real>
 void add_kernel_gradient(const Shape& shape, const Vector<Real>* x, const Vector<Real>* deltas,
                          Real* by_kernel) {
@@ -200,12 +195,12 @@ class MapsPass {
     Vec* padded;  // drive with zeros around
   };
 
-  // The units below whose row and column have certain remainders, when divided by the stride, get
-  // their deltas by a convolution of their own.
+  // Units below whose row and column have the same remainders when divided by the stride get their
+  // deltas by one convolution; each pair of remainders is a phase.
   struct Phase {
     Shape shape;
     int row, column;   // remainders
-    int top, left;     // where in the padded deltas it begins
+    int top, left;     // position in the padded deltas at which it begins
     Real* packed;
   };
 
@@ -336,7 +331,7 @@ void MapsPass<Real>::backward() {
   add_up();
 }
 
-// Frames of `size` numbers, one a lane; lanes left over get `beyond`, or repeat the last frame.
+// Frames of `size` values, one in each lane; unused lanes get `beyond`, or repeat the last frame.
 template <typename Real>
 void MapsPass<Real>::gather_frames(const Real* arrays, int size, int group, const Real* beyond,
                                    Vec* to) const {
@@ -370,7 +365,7 @@ void MapsPass<Real>::drive(int group, const Scratch& scratch) const {
   scatter_frames(scratch.drive, units(), group, problem_.activity);
 }
 
-// Calls function(offset, count) for whole vectors and the rest of a segment of a row of units.
+// Calls function(offset, count) for the whole vectors of a segment of a row of units, and the rest.
 template <typename Real, typename Function>
 inline void each_vector(int segment, int units, Function function) {
   constexpr int kLanes = Simd<Real>::kLanes;
@@ -392,7 +387,7 @@ inline void store_some(Real* to, const Vector<Real>& vector, int count) {
   std::memcpy(to, &vector, count * sizeof(Real));
 }
 
-// eq. (3)'s leak and eq. (4), in place, for some units of one sequence.
+// The leaky integration of eq. (3), and eq. (4), in place, for a segment of units of one sequence.
 template <typename Real>
 void MapsPass<Real>::leak(int index) const {
   const Real leak = Real(problem_.leak);
@@ -407,7 +402,7 @@ void MapsPass<Real>::leak(int index) const {
   }
 }
 
-// The deltas of some units of one sequence: from the last step to the first.
+// The deltas of a segment of units of one sequence, from the last step to the first.
 template <typename Real>
 void MapsPass<Real>::leak_backward(int index) const {
   const Real leak = Real(problem_.leak);

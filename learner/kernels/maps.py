@@ -1,16 +1,18 @@
-"""A subnet of feature maps on the CPU, whole sequences in one call of C++. See `maps.cpp`."""
+"""A subnet of feature maps (V_F, V_S) on the CPU: one call of C++ for whole sequences.
+
+`maps.cpp` says how it is computed.
+"""
 
 from __future__ import annotations
 
 import ctypes
-import functools
 from typing import Any, Final, cast
 
 import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from learner.kernels.library import learning_library
+from learner.kernels.library import TypedKernel
 
 _COUNTS: Final = (
     *("sequences", "steps", "threads", "maps_below", "height_below", "width_below"),
@@ -32,20 +34,27 @@ class _Problem(ctypes.Structure):
     )
 
 
-def serves(below: Tensor) -> bool:
-    """Whether the kernel can compute on this, where and of what type it is."""
-    return below.device.type == "cpu" and below.dtype in _functions()
+_KERNEL: Final = TypedKernel("vmdnn_maps", (ctypes.POINTER(_Problem),), ctypes.c_int)
+
+supports = _KERNEL.supports
 
 
 def maps(below: Tensor, kernel: Tensor, bias: Tensor, stride: int, tau: float) -> Tensor:
-    """`learner.network.mstnn.Maps`, computed by the kernel; differentiable once.
+    """Activity of a subnet, as `learner.network.mstnn.Maps` defines it; differentiable once.
 
     Args:
         below: (B, T, maps below, height, width).
         kernel: (maps, maps below, height, width).
         bias: (maps,).
         stride: shift of the kernel between neighbouring units.
-        tau: time constant.
+        tau: time constant in control steps.
+
+    Returns:
+        (B, T, maps, rows, columns).
+
+    Raises:
+        ValueError: shapes or types do not fit together.
+        MemoryError: there is not enough memory.
     """
     if below.dim() != 5 or below.shape[2] != kernel.shape[1]:
         raise ValueError(f"below is {tuple(below.shape)}, but the kernel {tuple(kernel.shape)}")
@@ -117,13 +126,5 @@ def _call(
         leak=1 / tau,
         **{name: array.data_ptr() for name, array in arrays.items()},
     )
-    if _functions()[below.dtype](ctypes.byref(problem)) != 0:
+    if _KERNEL(below.dtype, ctypes.byref(problem)) != 0:
         raise MemoryError(f"there is no memory for the maps of {sequences} sequences")
-
-
-@functools.cache
-def _functions() -> dict[torch.dtype, Any]:
-    library = learning_library()
-    if library is None:
-        return {}
-    return {torch.float32: library.vmdnn_maps_float, torch.float64: library.vmdnn_maps_double}

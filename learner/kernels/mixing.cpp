@@ -1,5 +1,7 @@
-// Weighted sums of sequences: of what is seen in them, and of their targets, put into code.
-// `learner.interpolation` says the same in PyTorch; `learner.kernels.mixing` calls this.
+// Weighted sums of sequences: of the activity of V_S, and of the targets, which are then coded.
+//
+// `learner.training.interpolation` defines the same in PyTorch; `learner.kernels.mixing` calls
+// this.
 
 #include <algorithm>
 #include <cmath>
@@ -15,7 +17,7 @@ namespace {
 template <typename Real>
 struct MixingProblem {
   std::int32_t mixtures;
-  std::int32_t parts;  // of each mixture
+  std::int32_t parts;  // sequences in each mixture
   std::int32_t steps;
   std::int32_t inputs;         // units of V_S
   std::int32_t values;         // of an action
@@ -56,7 +58,7 @@ class Coding {
   explicit Coding(const MixingProblem<Real>& problem)
       : problem_(problem), excitations_(padded(problem.values * problem.softmax_units)) {}
 
-  // The code of one action (values); returns the sum of code * log(code).
+  // Codes one action (values,); returns the sum of code * log(code).
   Real encode(const Real* action, Real* code) {
     constexpr int kLanes = Simd<Real>::kLanes;
     const int units = problem_.softmax_units;
@@ -90,7 +92,7 @@ class Coding {
   }
 
  private:
-  // A vector may be read from any unit on.
+  // With room for a vector that is read from the last unit on.
   static std::size_t padded(int count) { return std::size_t(count) + Simd<Real>::kLanes; }
 
   const MixingProblem<Real>& problem_;
@@ -99,24 +101,25 @@ class Coding {
 
 template <typename Real>
 void mix_all(const MixingProblem<Real>& problem) {
-  const std::ptrdiff_t seen = std::ptrdiff_t(problem.steps) * problem.inputs;
-  const std::ptrdiff_t acted = std::ptrdiff_t(problem.steps) * problem.values;
-  std::vector<const Real*> sights(problem.parts), plans(problem.parts);
-  std::vector<Real> plan(acted);
+  const std::ptrdiff_t seen_size = std::ptrdiff_t(problem.steps) * problem.inputs;
+  const std::ptrdiff_t target_size = std::ptrdiff_t(problem.steps) * problem.values;
+  std::vector<const Real*> seen_parts(problem.parts), target_parts(problem.parts);
+  std::vector<Real> targets(target_size);
   Coding<Real> coding(problem);
   for (int mixture = 0; mixture < problem.mixtures; ++mixture) {
     const std::int64_t* members = problem.members + std::ptrdiff_t(mixture) * problem.parts;
     const Real* weights = problem.weights + std::ptrdiff_t(mixture) * problem.parts;
     for (int part = 0; part < problem.parts; ++part) {
-      sights[part] = problem.seen + members[part] * seen;
-      plans[part] = problem.targets + members[part] * acted;
+      seen_parts[part] = problem.seen + members[part] * seen_size;
+      target_parts[part] = problem.targets + members[part] * target_size;
     }
-    mix(sights.data(), weights, problem.parts, seen, problem.mixed_seen + mixture * seen);
-    mix(plans.data(), weights, problem.parts, acted, plan.data());
+    mix(seen_parts.data(), weights, problem.parts, seen_size,
+        problem.mixed_seen + mixture * seen_size);
+    mix(target_parts.data(), weights, problem.parts, target_size, targets.data());
     for (int step = 0; step < problem.steps; ++step) {
       const std::ptrdiff_t place = std::ptrdiff_t(mixture) * problem.steps + step;
       problem.code_entropies[place] =
-          coding.encode(plan.data() + std::ptrdiff_t(step) * problem.values,
+          coding.encode(targets.data() + std::ptrdiff_t(step) * problem.values,
                         problem.codes + place * problem.values * problem.softmax_units);
     }
   }

@@ -1,17 +1,17 @@
-"""Mixtures of sequences on the CPU, a whole minibatch in one call of C++. See `mixing.cpp`."""
+"""Weighted sums of sequences on the CPU: one call of C++ for a whole minibatch (`mixing.cpp`)."""
 
 from __future__ import annotations
 
 import ctypes
-import functools
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.kernels.library import learning_library
-from learner.network.softmax_code import SoftmaxCode
-from learner.training.sequences import Sequences
+from learner.kernels.library import TypedKernel
 
 _COUNTS: Final = ("mixtures", "parts", "steps", "inputs", "values", "softmax_units")
 _ARRAYS: Final = (
@@ -30,55 +30,111 @@ class _Problem(ctypes.Structure):
     )
 
 
-def serves(sequences: Sequences) -> bool:
-    """Whether the kernel can compute on these sequences, where and of what type they are."""
-    seen = sequences.seen
-    return seen.device.type == "cpu" and seen.dtype in _functions()
+_KERNEL: Final = TypedKernel("vmdnn_mix", (ctypes.POINTER(_Problem),))
+
+supports = _KERNEL.supports
 
 
-def mixed(
-    members: Tensor,
-    weights: Tensor,
-    sequences: Sequences,
-    targets: Tensor,
-    code: SoftmaxCode,
-    mask: Tensor,
-) -> Sequences:
-    """`learner.training.interpolation.mixed`, computed by the kernel."""
-    seen = sequences.seen.contiguous()
+class SoftmaxArrays(Protocol):
+    """The arrays of a softmax code of action values, as `learner.network.softmax_code` has them."""
+
+    @property
+    def minima(self) -> NDArray[np.float64]:
+        """(values,) lowest value of each range."""
+
+    @property
+    def maxima(self) -> NDArray[np.float64]:
+        """(values,) highest value of each range."""
+
+    @property
+    def references(self) -> NDArray[np.float64]:
+        """(values, softmax units) the value that each unit stands for."""
+
+    @property
+    def widths(self) -> NDArray[np.float64]:
+        """(values,) standard deviation of the excitation."""
+
+
+@dataclass(frozen=True)
+class MixedArrays:
+    """B mixtures of sequences.
+
+    Attributes:
+        seen: (B, T, inputs) mixed activity of V_S.
+        codes: (B, T, values, softmax units) the mixed targets in code.
+        code_entropies: (B, T) sum of codes * log(codes).
+    """
+
+    seen: Tensor
+    codes: Tensor
+    code_entropies: Tensor
+
+
+def mix(
+    members: Tensor, weights: Tensor, seen: Tensor, targets: Tensor, code: SoftmaxArrays
+) -> MixedArrays:
+    """Mix sequences and code the mixed targets.
+
+    Args:
+        members: (B, parts) int64 indices of sequences.
+        weights: (B, parts) share of each part.
+        seen: (S, T, inputs) activity of V_S; its type is that of the results.
+        targets: (S, T, values) actions.
+        code: how actions are coded.
+
+    Raises:
+        ValueError: the sizes do not fit together.
+        IndexError: a member is none of the S sequences.
+    """
+    _check(members, weights, seen, targets, code)
     count, parts = members.shape
     _, steps, inputs = seen.shape
     values, softmax_units = code.references.shape
-    made = Sequences(
+    mixed = MixedArrays(
         seen=seen.new_empty(count, steps, inputs),
         codes=seen.new_empty(count, steps, values, softmax_units),
-        mask=mask,
         code_entropies=seen.new_empty(count, steps),
     )
-    # named here so that they live as long as the kernel reads them
-    ranges = [
-        torch.from_numpy(each).to(seen.dtype).contiguous()
-        for each in (code.minima, code.maxima, code.references, code.widths)
+    # named, so that these arrays live until the kernel has read them
+    arrays = [
+        members.contiguous(),
+        *(_like(seen, each) for each in (weights, seen, targets)),
+        *(
+            _like(seen, torch.from_numpy(each))
+            for each in (code.minima, code.maxima, code.references, code.widths)
+        ),
+        mixed.seen,
+        mixed.codes,
+        mixed.code_entropies,
     ]
-    given = [members.contiguous(), weights.to(seen.dtype).contiguous(), seen]
-    given += [targets.to(seen.dtype).contiguous(), *ranges]
-    arrays = [*given, made.seen, made.codes, made.code_entropies]
     problem = _Problem(
         *(count, parts, steps, inputs, values, softmax_units),
         *(array.data_ptr() for array in arrays),
     )
-    _functions()[seen.dtype](ctypes.byref(problem))
-    return made
+    _KERNEL(seen.dtype, ctypes.byref(problem))
+    return mixed
 
 
-@functools.cache
-def _functions() -> dict[torch.dtype, Any]:
-    """The kernel by type, none where it cannot be compiled."""
-    library = learning_library()
-    if library is None:
-        return {}
-    functions = {torch.float32: library.vmdnn_mix_float, torch.float64: library.vmdnn_mix_double}
-    for function in functions.values():
-        function.restype = None
-        function.argtypes = (ctypes.POINTER(_Problem),)
-    return functions
+def _like(seen: Tensor, values: Tensor) -> Tensor:
+    return values.to(seen.dtype).contiguous()
+
+
+def _check(
+    members: Tensor, weights: Tensor, seen: Tensor, targets: Tensor, code: SoftmaxArrays
+) -> None:
+    """The kernel follows sizes and indices without checking them."""
+    values = len(code.references)
+    if members.dtype != torch.int64 or members.dim() != 2 or members.numel() == 0:
+        raise ValueError(
+            f"members are {tuple(members.shape)} {members.dtype}, not (B, parts) int64"
+        )
+    if weights.shape != members.shape:
+        raise ValueError(f"weights are {tuple(weights.shape)}, not {tuple(members.shape)}")
+    if targets.shape != (*seen.shape[:2], values):
+        raise ValueError(
+            f"targets are {tuple(targets.shape)}, but seen is {tuple(seen.shape)} and the code has"
+            f" {values} values"
+        )
+    lowest, highest = (int(each) for each in torch.aminmax(members))
+    if not 0 <= lowest <= highest < len(seen):
+        raise IndexError(f"members go from {lowest} to {highest}, but there are {len(seen)}")

@@ -1,4 +1,4 @@
-// Vectors of the machine, and what a network computes of them.
+// Vectors of the processor, and functions of them that a network needs.
 
 #pragma once
 

@@ -1,8 +1,9 @@
 """MSTNN: the vision pathway V_I > V_F > V_S (paper, eq. (3) and (4)), whole sequences at once.
 
-Neither subnet gets anything from above or from itself but its own leak. So the convolutions run
-over all steps of all sequences together. That is compiled where there is a compiler; elsewhere it
-is PyTorch, and the leak is one product with a triangular matrix.
+A subnet gets input from the subnet below only, so the convolutions of all steps of all sequences
+are computed together, and the leaky integration over the steps follows. Both are compiled where a
+compiler is found. Elsewhere PyTorch computes them, the integration as a product with a triangular
+matrix.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from learner.kernels import maps as kernels
+from learner.kernels import maps as maps_kernel
 from learner.network.subnets import ACTIVATION_GAIN, ACTIVATION_SLOPE, Subnet
 
 
@@ -36,13 +37,13 @@ class Maps(nn.Module):
             self.register_parameter(name, nn.Parameter(torch.zeros(shape)))
 
     def forward(self, below: Tensor) -> Tensor:
-        """Activity (B, T, maps, height, width) for that of the subnet below, alike."""
-        if kernels.serves(below):
-            return kernels.maps(below, self.kernel, self.bias, self.stride, self.tau)
+        """Activity (B, T, maps, height, width) for that of the subnet below, shaped alike."""
+        if maps_kernel.supports(below):
+            return maps_kernel.maps(below, self.kernel, self.bias, self.stride, self.tau)
         return self.reference(below)
 
     def reference(self, below: Tensor) -> Tensor:
-        """What the compiled kernel computes, in PyTorch."""
+        """`forward` in PyTorch; it defines what the compiled kernel computes."""
         batch, steps = below.shape[:2]
         drive = _convolve(below.flatten(0, 1), self.kernel, self.bias, self.stride)
         potentials = leaky_integral(drive.view(batch, steps, -1), self.tau)
@@ -50,7 +51,7 @@ class Maps(nn.Module):
 
 
 def activation(potentials: Tensor) -> Tensor:
-    """The f of eq. (2) and (4), 1.7159 tanh(2/3 x)."""
+    """f(x) = 1.7159 tanh(2/3 x), eq. (2) and (4)."""
     return ACTIVATION_GAIN * torch.tanh(ACTIVATION_SLOPE * potentials)
 
 
@@ -69,8 +70,8 @@ def leaky_integral(drive: Tensor, tau: float) -> Tensor:
 def _convolve(images: Tensor, kernel: Tensor, bias: Tensor, stride: int) -> Tensor:
     """Strided convolution without padding.
 
-    Where the stride divides all sizes, its pixels are first sorted into channels: the same sums,
-    1.7 times as fast.
+    Where the stride divides all sizes, pixels are first sorted into channels, which gives the same
+    sums 1.7 times as fast.
     """
     sizes = (*images.shape[-2:], *kernel.shape[-2:])
     if all(size % stride == 0 for size in sizes):

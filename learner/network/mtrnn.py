@@ -1,7 +1,8 @@
 """The recurrent levels PFC > M_S > M_F (paper, eq. (1) and (2)) and their scan through time.
 
-A level is a continuous-time network of leaky integrators. It gets the level below it on the way
-from vision to movement (V_S for the PFC), itself, and feedback from the next level.
+A level is a continuous-time network of leaky integrators. Its input is the activity of the level
+before it on the way from vision to movement (V_S for the PFC), its own activity, and feedback from
+the next level.
 """
 
 from __future__ import annotations
@@ -48,9 +49,13 @@ def run_levels(
 ) -> Tensor:
     """Activity (B, T, units) of the last level for the activity (B, T, F) below the first.
 
-    Bottom-up, a level sees the activity below it of the same step, and feedback and recurrence of
-    the step before. Literally, by eq. (1), everything is of the step before. `initial` (B, units
-    of all levels) are the potentials before the first step; without it they are at rest.
+    Args:
+        levels: the levels, from the PFC on.
+        below: (B, T, F) activity of V_S.
+        order: "bottom_up": a level gets the activity below it of the same step, and feedback and
+            recurrence of the step before. "literal": all input is of the step before, as eq. (1) is
+            printed.
+        initial: (B, units of all levels) potentials before the first step, or None for zero.
     """
     first = levels[0]
     if order == "literal":
@@ -65,13 +70,13 @@ def run_levels(
 
 
 def one_step_later(activity: Tensor, before: Tensor | None = None) -> Tensor:
-    """Activity (B, T, F) as it was one step before; `before` (B, F) the first, else at rest."""
+    """Activity (B, T, F) delayed by one step; `before` (B, F) comes first, by default zero."""
     first = torch.zeros_like(activity[:, 0]) if before is None else before
     return torch.cat([first[:, None], activity[:, :-1]], dim=1)
 
 
 def _drive(levels: Sequence[Level], seen: Tensor) -> Tensor:
-    """(T, N, B): what reaches all N units from outside the levels: V_S (B, T, n) and biases."""
+    """(T, N, B) input of all N units from outside: weighted V_S (B, T, n), and biases."""
     seen = seen.permute(1, 2, 0)
     others = sum(level.units for level in levels[1:])
     biases = torch.cat([level.bias for level in levels])
@@ -79,7 +84,7 @@ def _drive(levels: Sequence[Level], seen: Tensor) -> Tensor:
 
 
 def _delayed_weights(levels: Sequence[Level], *, with_input: bool) -> Tensor:
-    """(N, N), to x from: recurrence and feedback, and with_input also the level below."""
+    """(N, N) weights, to x from: recurrence, feedback and, with_input, those of the level below."""
     rows = []
     for to, level in enumerate(levels):
         row = [level.bias.new_zeros(level.units, source.units) for source in levels]
@@ -102,15 +107,15 @@ def recurrent_scan(
     """Run leaky integrators through time.
 
     u[t] = (1 - leaks) u[t-1] + leaks (drive[t] + delayed y[t-1] + immediate y[t]), y[t] = f(u[t]).
-    Units are stacked level on level. This is where training spends its time.
+    The units of all levels are numbered in the order of the levels.
 
     Args:
         drive: (T, N, B) input from outside.
         leaks: (N,) 1 / tau of each unit.
         delayed: (N, N) weights of the activity one step before, to x from.
-        immediate: weights of each level but the first on the level before it, within the step;
-            empty when nothing acts within a step.
-        initial: (N, B) potentials u before the first step; without it they are at rest, zero.
+        immediate: for each level but the first, weights of the activity of the level before it in
+            the same step; empty if no connection acts within a step.
+        initial: (N, B) potentials u before the first step, or None for zero.
 
     Returns:
         Activity (T, N, B), differentiable by drive, delayed, immediate and initial.
@@ -137,7 +142,7 @@ def recurrent_scan(
 
 
 def _spans(delayed: Tensor, immediate: Sequence[Tensor]) -> list[slice]:
-    """The units of each level; one span for all when nothing acts within a step."""
+    """The units of each level; one span for all if no connection acts within a step."""
     sizes = [len(block) for block in immediate]
     bounds = accumulate(sizes, initial=len(delayed) - sum(sizes))
     return [slice(start, end) for start, end in pairwise((0, *bounds))]
@@ -178,7 +183,7 @@ class _Scan(torch.autograd.Function):
 def _run(
     drive: Tensor, keep: Tensor, initial: Tensor, delayed: Tensor, immediate: Sequence[Tensor]
 ) -> Tensor:
-    """The activities h (T, N, B) of `_Scan`."""
+    """The activities h (T, N, B) of `_Scan`, computed forward."""
     steps, units, batch = drive.shape
     spans = _spans(delayed, immediate)
     keep = keep[:, None]

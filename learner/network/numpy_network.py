@@ -1,66 +1,38 @@
-"""VMDNN one step at a time (paper, section 3.2), for acting: no gradients, no PyTorch, fast.
+"""VMDNN one step at a time (paper, section 3.2), in numpy: no gradients and no PyTorch.
 
-It gives the same numbers as `learner.network.vmdnn` gives for the whole sequence. The compiled
-network (`learner.kernels.acting`) is faster still. A picture is one line of numbers, row after
-row. The rows that a row of units sees follow one another in it, so a strided
-convolution is one matrix product: overlapping stretches of that line by the kernels laid out as a
-band along the width.
+It gives the numbers that `learner.network.vmdnn` gives for a whole sequence.
+
+An image is read as one row of numbers, image row after image row. The image rows that one row of
+units sees are neighbours in it. So a strided convolution is one matrix product: overlapping
+stretches of the long row times a band matrix, which holds the kernel once for each unit of a row.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
-from learner.kernels import acting
-from learner.network.subnets import ACTIVATION_GAIN, ACTIVATION_SLOPE, Subnet, subnets
+from learner.network.subnets import (
+    ACTIVATION_GAIN,
+    ACTIVATION_SLOPE,
+    Array,
+    Parameters,
+    Subnet,
+    subnets,
+)
 from proto.config import NetworkConfig
-
-Array = NDArray[np.floating]
-Parameters = Mapping[str, Array]
-
-
-class ActingNetwork(Protocol):
-    """The network as it acts; its state is neutral until the first step."""
-
-    def reset(self) -> None:
-        """Return to the neutral state."""
-
-    def step(self, image: Array) -> Array:
-        """Outputs (11, softmax units) for the image (height, width) seen now, -1..1."""
-
-    def see(self, image: Array) -> Array:
-        """The first half of a step: activity (units,) of V_S."""
-
-    def act(self, seen: Array) -> Array:
-        """The second half: outputs for what `see` returned."""
-
-
-def make_acting_network(config: NetworkConfig, parameters: Parameters) -> ActingNetwork:
-    """The network compiled, in float32, or in numpy where nothing can be compiled.
-
-    Args:
-        config: the network's sizes.
-        parameters: float32 arrays by name, shaped as `parameter_shapes(config)`.
-    """
-    if acting.available():
-        return acting.CompiledNetwork(config, parameters)
-    return NumpyNetwork(config, parameters)
 
 
 class NumpyNetwork:
-    """The network in numpy.
-
-    Args:
-        config: the network's sizes.
-        parameters: float32 or float64 arrays by name, shaped as `parameter_shapes(config)`.
-    """
+    """An `ActingNetwork` in numpy."""
 
     def __init__(self, config: NetworkConfig, parameters: Parameters) -> None:
+        """Lay out the parameters; they are not copied where their layout already fits.
+
+        Args:
+            config: the network's sizes.
+            parameters: float32 or float64 arrays by name, shaped as `parameter_shapes(config)`.
+        """
         by_name = subnets(config)
         fast, slow = by_name["mstnn_fast"], by_name["mstnn_slow"]
         self._bottom_up = config.update_order == "bottom_up"
@@ -94,11 +66,11 @@ class NumpyNetwork:
         return self.act(self.see(image))
 
     def see(self, image: Array) -> Array:
-        """Activity (units,) of V_S, the maps of one place side by side."""
+        """The first half of a step: activity (units,) of V_S, for each place that of all maps."""
         return self._mstnn_slow.step(self._mstnn_fast.step(image)).ravel()
 
     def act(self, seen: Array) -> Array:
-        """Outputs (11, softmax units) for what `see` returned."""
+        """The second half: outputs (11, softmax units) for what `see` returned."""
         before = self._activity
         now = [seen]
         source = now if self._bottom_up else before
@@ -113,7 +85,7 @@ class NumpyNetwork:
 
     @property
     def activity(self) -> dict[str, Array]:
-        """Activity (units,) of each subnet by name after the last step, but V_I and M_O.
+        """Activity (units,) of each subnet but V_I and M_O after the last step, by name.
 
         The units of V_F and V_S are ordered by map, row and column.
         """
@@ -128,7 +100,7 @@ class NumpyNetwork:
 
 
 class _Maps:
-    """V_F or V_S; activity is (height, width x maps), the maps of one place side by side."""
+    """V_F or V_S; its activity is (height, width x maps): for each place that of all maps."""
 
     def __init__(self, below: Subnet, subnet: Subnet, weights: dict[str, Array]) -> None:
         maps_below, _, width_below = below.shape

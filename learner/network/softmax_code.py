@@ -1,8 +1,8 @@
-"""How M_O codes an analog value: a softmax over units that each stand for a reference value.
+"""The code of M_O: for each analog value a softmax over units with reference values.
 
-A value x excites unit i by exp(-(reference_i - x)^2 / (2 width^2)), normalized over its units; it
-is read back as the mean of the references under the outputs. The references reach beyond the
-range of the values by a margin, without which the ends of the range could not be represented.
+A value x excites unit i by exp(-(reference_i - x)^2 / (2 width^2)), normalized over its units. It
+is decoded as the mean of the references weighted by the outputs. The references reach beyond the
+range of the values by a margin; without it the ends of the range could not be represented.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Values = NDArray[np.float64]
 _LOWEST: Final = np.array([value.minimum for value in ACTION_VALUES])
 _HIGHEST: Final = np.array([value.maximum for value in ACTION_VALUES])
 _NARROWEST_RANGE: Final = 1.0
-"""A value that never changes still gets a range (degrees, or levels)."""
+"""Smallest range of a value, for values that never change (degrees, or levels)."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class SoftmaxCode:
     """The code of the eleven action values.
 
     Attributes:
-        minima: (11,) lowest value of each range; lower ones are coded as this.
-        maxima: (11,) highest value of each range; higher ones are coded as this.
+        minima: (11,) lowest value of each range; lower values are coded as it.
+        maxima: (11,) highest value of each range; higher values are coded as it.
         references: (11, softmax units) the value that each unit stands for.
         widths: (11,) standard deviation of the excitation.
     """
@@ -42,10 +42,13 @@ class SoftmaxCode:
 
     @classmethod
     def of_ranges(cls, minima: Values, maxima: Values, config: NetworkConfig) -> Self:
-        """A code for ranges (11,), (11,).
+        """A code for some ranges.
 
-        `config.code_margin` is the margin at each end as a fraction of the range, and
-        `config.code_width` the width of the excitation in spacings of the references.
+        Args:
+            minima: (11,).
+            maxima: (11,).
+            config: `code_margin` is the margin at each end as a fraction of the range, `code_width`
+                the width of the excitation in spacings of the references.
         """
         minima, maxima = np.asarray(minima, np.float64), np.asarray(maxima, np.float64)
         margins = config.code_margin * (maxima - minima)

@@ -1,8 +1,7 @@
-"""The subnets of VMDNN (paper, section 4.1): their sizes and parameters follow from the config.
+"""The subnets of VMDNN (paper, section 4.1): sizes and parameters, computed from the config.
 
-This is the only place where sizes are computed. The network that learns (`learner.network.vmdnn`,
-PyTorch), the network that acts (`learner.network.numpy_network`) and `vmdnn inspect network` are
-built from it.
+Sizes are computed here only. The network that learns (`learner.network.vmdnn`), the networks that
+act (`learner.network.acting`) and `vmdnn inspect network` use them.
 """
 
 from __future__ import annotations
@@ -12,15 +11,21 @@ from dataclasses import dataclass
 from math import prod
 from typing import Final
 
-from proto.body import ACTION_SIZE
+import numpy as np
+from numpy.typing import NDArray
+
+from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.config import MapsConfig, NetworkConfig
 from proto.errors import UserError
 
 ACTIVATION_GAIN: Final = 1.7159
 ACTIVATION_SLOPE: Final = 2 / 3
-"""f(x) = 1.7159 tanh(2/3 x), eq. (2), of every unit but those of V_I and M_O."""
+"""f(x) = 1.7159 tanh(2/3 x), eq. (2): activation of all units but those of V_I and M_O."""
 
 Shape = tuple[int, ...]
+Array = NDArray[np.floating]
+Parameters = Mapping[str, Array]
+"""Arrays by full name, such as `pfc.recurrent`; see `parameter_shapes`."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,7 @@ class Subnet:
     """One subnet.
 
     Attributes:
-        name: the paper's name in words; the prefix of its parameters in files.
+        name: the paper's name in words; prefix of its parameters' names.
         symbol: the paper's symbol.
         shape: shape of its activity: (maps, height, width), (units,) or (values, softmax units).
         tau: time constant in control steps.
@@ -63,8 +68,7 @@ def subnets(config: NetworkConfig) -> dict[str, Subnet]:
     Raises:
         UserError: a kernel is larger than what it looks at.
     """
-    width, height = config.image
-    vision = Subnet("vision_input", "V_I", (1, height, width), 1.0, None, None, {})
+    vision = Subnet("vision_input", "V_I", (1, IMAGE_HEIGHT, IMAGE_WIDTH), 1.0, None, None, {})
     fast = _maps("mstnn_fast", "V_F", vision, config.mstnn_fast)
     slow = _maps("mstnn_slow", "V_S", fast, config.mstnn_slow)
     _, slow_height, slow_width = slow.shape

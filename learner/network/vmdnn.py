@@ -39,7 +39,7 @@ class Outputs(nn.Module):
 
 
 class VMDNN(nn.Module):
-    """The network as it learns: pictures of whole sequences in, outputs of all steps out.
+    """The network for learning: from the images of whole sequences to the outputs of all steps.
 
     Every sequence starts from the neutral state, zero. Parameters are zero until `initialize`.
     """
@@ -58,7 +58,7 @@ class VMDNN(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Logarithms of the outputs (B, T, 11, softmax units) for images (B, T, height, width).
 
-        Brightness is -1..1. Sequences shorter than T may be filled up at their end with anything:
+        Brightness is -1..1. Sequences shorter than T may be padded at their end with any images:
         no step depends on a later one.
         """
         return self.act(self.see(images))
@@ -72,8 +72,10 @@ class VMDNN(nn.Module):
     def act(self, seen: Tensor, initial: Tensor | None = None) -> Tensor:
         """Logarithms of the outputs (B, T, 11, softmax units) for V_S (B, T, units).
 
-        `initial` (B, units of PFC, M_S and M_F) are the potentials before the first step, by
-        default zero, the neutral state.
+        Args:
+            seen: activity of V_S.
+            initial: (B, units of PFC, M_S and M_F) potentials before the first step, or None for
+                zero, the neutral state.
         """
         order = self.config.update_order
         fast = run_levels(self.levels(), seen, order, initial)
@@ -88,7 +90,7 @@ class VMDNN(nn.Module):
         return self.pfc, self.mtrnn_slow, self.mtrnn_fast
 
     def core_parameters(self) -> list[nn.Parameter]:
-        """Parameters of PFC, M_S, M_F and M_O, in the order in which the kernels have them."""
+        """Parameters of PFC, M_S, M_F and M_O, ordered as in `learner.kernels.core.CoreInputs`."""
         parameters = []
         for level in self.levels():
             parameters += [level.input, level.recurrent, level.feedback, level.bias]
@@ -96,18 +98,24 @@ class VMDNN(nn.Module):
         return [cast("nn.Parameter", each) for each in parameters if each is not None]
 
     def vision(self) -> tuple[Maps, Maps]:
-        """The subnets that pre-training forms and coupled training leaves alone."""
+        """V_F and V_S: pre-training trains them, coupled training does not."""
         return self.mstnn_fast, self.mstnn_slow
 
     def coupled_parameters(self) -> list[nn.Parameter]:
-        """What coupled training changes: everything but the vision (section 3.3)."""
+        """The parameters that coupled training trains: all but the vision's (section 3.3)."""
         coupled = (*self.levels(), self.outputs)
         return [parameter for module in coupled for parameter in module.parameters()]
 
     def initialize(
         self, generator: torch.Generator, *, initial_range: float, pfc_input_range: float
     ) -> None:
-        """Draw every parameter uniformly from -range..range."""
+        """Draw every parameter uniformly from -range..range.
+
+        Args:
+            generator: draws them.
+            initial_range: range of all parameters but those below.
+            pfc_input_range: range of the weights from V_S to the PFC.
+        """
         with torch.no_grad():
             for name, parameter in self.named_parameters():
                 limit = pfc_input_range if name == "pfc.input" else initial_range

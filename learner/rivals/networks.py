@@ -1,8 +1,8 @@
-"""A small CNN with an LSTM, and one that acts from the current picture alone.
+"""A small CNN with an LSTM, and one that acts from the current image alone.
 
-Both see what VMDNN sees and have its outputs and, by default, about its number of weights. Their
-vision, the eye, is the same: two convolutions whose maps tell where in the picture they are most
-active, which is what a hand that is to go there needs (Levine et al. 2016).
+Both get the images that VMDNN gets and have its outputs and, by default, about its number of
+weights. Both have the same vision, the eye: two convolutions, and for each map the position in the
+image at which it is most active (spatial softmax, Levine et al. 2016).
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from proto.body import ACTION_SIZE
 from proto.config import ComparisonConfig, NetworkConfig, RivalConfig, RivalKind
 
 State = tuple[Tensor, Tensor] | None
-"""Hidden activity and cells of an LSTM, (1, B, units) each; None before the first step."""
+"""Hidden activity and cell state of an LSTM, (1, B, units) each; None before the first step."""
 
 _MAPS: Final = 16
 FEATURES: Final = 2 * _MAPS
 
 
 class Rival(nn.Module):
-    """Eye, then an LSTM or a hidden layer, then the outputs of M_O."""
+    """Eye > LSTM or hidden layer > outputs as those of M_O."""
 
     def __init__(self, kind: RivalKind, units: int, config: NetworkConfig) -> None:
         super().__init__()
@@ -41,7 +41,7 @@ class Rival(nn.Module):
     def see(self, images: Tensor) -> Tensor:
         """Features (B, T, 32) for images (B, T, height, width), brightness -1..1."""
         maps = self.eye(images.flatten(0, 1).unsqueeze(1))
-        return _places(maps).view(*images.shape[:2], FEATURES)
+        return _positions(maps).view(*images.shape[:2], FEATURES)
 
     def act(self, seen: Tensor, state: State = None) -> tuple[Tensor, State]:
         """Logarithms of the outputs (B, T, 11, softmax units) for features, and the state after."""
@@ -53,14 +53,14 @@ class Rival(nn.Module):
         return functional.log_softmax(potentials, dim=-1), state
 
     def coupled_parameters(self) -> list[nn.Parameter]:
-        """All but the eye's."""
+        """All parameters but those of the eye."""
         return [
             parameter for name, parameter in self.named_parameters() if not name.startswith("eye.")
         ]
 
 
 def make_rival(kind: RivalKind, units: int, config: NetworkConfig, seed: int = 0) -> Rival:
-    """A network with random weights; the same seed gives the same."""
+    """A network with random weights, which the seed determines."""
     with torch.random.fork_rng(devices=()):
         torch.manual_seed(seed)
         return Rival(kind, units, config)
@@ -72,12 +72,12 @@ def rival_config(config: ComparisonConfig, kind: RivalKind) -> RivalConfig:
 
 
 def weights_of(network: nn.Module) -> int:
-    """Number of its weights, biases counted too."""
+    """Number of a network's weights and biases."""
     return sum(parameter.numel() for parameter in network.parameters())
 
 
-def _places(maps: Tensor) -> Tensor:
-    """Mean row and column (N, 2 x maps), each -1..1, under a softmax over each (N, maps, ...)."""
+def _positions(maps: Tensor) -> Tensor:
+    """Mean rows, then columns (N, 2 x maps), -1..1, by a softmax over each map (N, maps, H, W)."""
     height, width = maps.shape[-2:]
     weights = functional.softmax(maps.flatten(2), dim=-1).view_as(maps)
     rows = weights.sum(-1) @ torch.linspace(-1, 1, height)

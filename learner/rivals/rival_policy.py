@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,8 +9,10 @@ from numpy.typing import NDArray
 from learner.checkpoint import NETWORK_PREFIX, Checkpoint
 from learner.network.vision_input import vision_input
 from learner.rivals.networks import State, make_rival
+from learner.tensors import to_tensors
 from proto.episode import Image
 from proto.errors import UserError
+from proto.variables import Situation
 
 
 class RivalPolicy:
@@ -21,8 +21,8 @@ class RivalPolicy:
     Attributes:
         name: the run that trained it.
         version: its version in that run.
-        looks: always true; it acts on what it sees.
-        target: always None; it means what it does.
+        looks: always true; it acts on images.
+        target: always None; its actions are what it intends.
         outputs: (11 x softmax units,) float32, the outputs of the last step.
     """
 
@@ -30,10 +30,14 @@ class RivalPolicy:
     target: NDArray[np.float64] | None = None
 
     def __init__(self, checkpoint: Checkpoint, origin: str) -> None:
-        """Make a policy of a checkpoint; `origin` is where it came from, for messages.
+        """Make a policy of a checkpoint.
+
+        Args:
+            checkpoint: a checkpoint of a rival.
+            origin: where it comes from, for messages.
 
         Raises:
-            UserError: the checkpoint holds no rival, or another than its metadata describes.
+            UserError: the checkpoint holds no rival, or another one than its metadata describes.
         """
         metadata = checkpoint.metadata
         code = metadata.softmax_code()
@@ -45,15 +49,15 @@ class RivalPolicy:
         self._network = make_rival(metadata.rival.kind, metadata.rival.units, metadata.network)
         weights = checkpoint.part(NETWORK_PREFIX)
         try:
-            self._network.load_state_dict({k: torch.tensor(v) for k, v in weights.items()})
+            self._network.load_state_dict(to_tensors(weights))
         except RuntimeError as error:
             raise UserError(
                 f"{origin} does not hold what its metadata describes: {error}"
             ) from error
         self._state: State = None
 
-    def begin(self, situation: Mapping[str, float], seed: int) -> None:  # noqa: ARG002
-        """Forget everything; situation and seed mean nothing to a network."""
+    def begin(self, situation: Situation, seed: int) -> None:  # noqa: ARG002
+        """Return to the neutral state; situation and seed are not used."""
         self._state = None
 
     def step(self, image: Image) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
-"""Adam (Kingma and Ba 2015), after a long gradient has been shortened.
+"""Adam (Kingma and Ba 2015) with clipping of the gradient's norm.
 
-There is one definition, in PyTorch, and a kernel that computes the same in one pass.
+`reference_step` defines a step in PyTorch. `learner.kernels.adam` computes it in one pass.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from learner.kernels import adam as kernel
+from learner.kernels.adam import AdamArrays
 
 _MEAN_DECAY: Final = 0.9
 _SQUARE_DECAY: Final = 0.999
@@ -20,101 +21,88 @@ _EPSILON: Final = 1e-8
 
 
 class Adam:
-    """Changes parameters by their gradients.
+    """Optimizer of parameters.
 
-    Weights and gradients become parts of two flat arrays, where the parameters and their `grad`
-    show them as before. Gradients are added to `grad`, as `backward` does it; `grad` must not be
-    replaced. It is zero at the beginning and after every step.
+    Weights and gradients are moved into two flat arrays; the parameters and their `grad` become
+    views of these. Add gradients to `grad`, as `backward` does, and do not replace `grad`. It is
+    zero at the beginning and after every step.
     """
 
-    def __init__(self, parameters: Sequence[nn.Parameter], longest: float | None = None) -> None:
-        """Begin as if all earlier gradients had been zero.
+    def __init__(self, parameters: Sequence[nn.Parameter], max_norm: float | None = None) -> None:
+        """Start with running means of zero.
 
         Args:
-            parameters: what is changed; all on one device and of one type.
-            longest: norm to which a longer gradient, of all parameters together, is shortened.
+            parameters: what is optimized; all on one device and of one type.
+            max_norm: a gradient of all parameters together with a larger norm is scaled down to
+                it; None for no limit.
         """
-        self._longest = math.inf if longest is None else longest
+        self._max_norm = math.inf if max_norm is None else max_norm
         self._steps = 0
         self._shapes = [parameter.shape for parameter in parameters]
-        self._weights = torch.cat([parameter.detach().flatten() for parameter in parameters])
-        self._gradient = torch.zeros_like(self._weights)
-        self._means = torch.zeros_like(self._weights)
-        self._squares = torch.zeros_like(self._weights)
-        parts = zip(
-            parameters, self._parts(self._weights), self._parts(self._gradient), strict=True
+        weights = torch.cat([parameter.detach().flatten() for parameter in parameters])
+        self._arrays = AdamArrays(weights, *(torch.zeros_like(weights) for _ in range(3)))
+        views = zip(
+            parameters,
+            self._views(self._arrays.weights),
+            self._views(self._arrays.gradient),
+            strict=True,
         )
-        for parameter, weights, gradient in parts:
-            parameter.data = weights
+        for parameter, weight, gradient in views:
+            parameter.data = weight
             parameter.grad = gradient
 
     def step(self, rate: float) -> None:
-        """Change the parameters, at this rate, by the gradient, which is zero afterwards."""
+        """Change the parameters by their gradients, which are zero afterwards.
+
+        Args:
+            rate: learning rate.
+        """
         self._steps += 1
-        do_step = kernel.step if kernel.serves(self._weights) else reference_step
-        do_step(
-            self._weights,
-            self._gradient,
-            self._means,
-            self._squares,
-            steps=self._steps,
-            rate=rate,
-            longest=self._longest,
-        )
+        do_step = kernel.step if kernel.supports(self._arrays.weights) else reference_step
+        do_step(self._arrays, number=self._steps, rate=rate, max_norm=self._max_norm)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state, by index of the parameter and name, which are those of PyTorch's Adam."""
+        """The state, named `INDEX.NAME` as PyTorch's Adam names it; INDEX is the parameter's."""
         tensors = {}
-        for index, memory in enumerate(zip(*self._memory(), strict=True)):
+        for index, means in enumerate(zip(*self._means(), strict=True)):
             tensors[f"{index}.step"] = torch.tensor(float(self._steps))
-            tensors[f"{index}.exp_avg"], tensors[f"{index}.exp_avg_sq"] = memory
+            tensors[f"{index}.exp_avg"], tensors[f"{index}.exp_avg_sq"] = means
         return tensors
 
     def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take the state that `tensors` gave.
+        """Restore the state from what `tensors` returned.
 
         Raises:
-            KeyError: a part of it is missing.
+            KeyError: a tensor is missing.
         """
-        for index, (mean, square) in enumerate(zip(*self._memory(), strict=True)):
+        for index, (mean, square) in enumerate(zip(*self._means(), strict=True)):
             self._steps = int(tensors[f"{index}.step"])
             mean.copy_(tensors[f"{index}.exp_avg"])
             square.copy_(tensors[f"{index}.exp_avg_sq"])
 
-    def _memory(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Means of the gradient and of its squares, by parameter."""
-        return self._parts(self._means), self._parts(self._squares)
+    def _means(self) -> tuple[list[Tensor], list[Tensor]]:
+        """Running means of the gradient and of its squares, for each parameter."""
+        return self._views(self._arrays.means), self._views(self._arrays.squares)
 
-    def _parts(self, flat: Tensor) -> list[Tensor]:
-        """What of a flat array belongs to each parameter, in its shape."""
+    def _views(self, flat: Tensor) -> list[Tensor]:
+        """The part of a flat array that belongs to each parameter, in the parameter's shape."""
         parts = torch.split(flat, [shape.numel() for shape in self._shapes])
         return [part.view(shape) for part, shape in zip(parts, self._shapes, strict=True)]
 
 
-def reference_step(
-    weights: Tensor,
-    gradient: Tensor,
-    means: Tensor,
-    squares: Tensor,
-    *,
-    steps: int,
-    rate: float,
-    longest: float,
-) -> None:
-    """What a step means, in PyTorch.
+def reference_step(arrays: AdamArrays, *, number: int, rate: float, max_norm: float) -> None:
+    """A step in PyTorch; it defines what the compiled kernel computes.
 
     Args:
-        weights: (N,) changed.
-        gradient: (N,) by the weights; zero afterwards.
-        means: (N,) of the gradient, changed.
-        squares: (N,) means of its squares, changed.
-        steps: number of this step, from 1 on.
+        arrays: changed in place.
+        number: number of the step, from 1 on.
         rate: learning rate.
-        longest: norm to which a longer gradient is shortened; may be infinite.
+        max_norm: a gradient with a larger norm is scaled down to it; may be infinite.
     """
-    gradient *= min(1.0, longest / (gradient.norm().item() + 1e-6))
+    gradient, means, squares = arrays.gradient, arrays.means, arrays.squares
+    gradient *= min(1.0, max_norm / (gradient.norm().item() + 1e-6))
     means.lerp_(gradient, 1 - _MEAN_DECAY)
     squares.mul_(_SQUARE_DECAY).addcmul_(gradient, gradient, value=1 - _SQUARE_DECAY)
-    spread = (squares / (1 - _SQUARE_DECAY**steps)).sqrt_().add_(_EPSILON)
-    weights.addcdiv_(means, spread, value=-rate / (1 - _MEAN_DECAY**steps))
+    spread = (squares / (1 - _SQUARE_DECAY**number)).sqrt_().add_(_EPSILON)
+    arrays.weights.addcdiv_(means, spread, value=-rate / (1 - _MEAN_DECAY**number))
     gradient.zero_()

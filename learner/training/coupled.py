@@ -1,13 +1,13 @@
 """Coupled training of PFC, M_S, M_F and M_O on tutored sequences (paper, section 3.3).
 
-The pre-trained vision does not change any more and gets nothing from above, so what it makes of a
-sequence is computed once, when the sequence comes in.
+The pre-trained vision stays as it is and gets no input from above, so V_S is computed once for each
+sequence, when the sequence is added.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,123 +19,125 @@ from torch.nn.utils.rnn import pad_sequence
 from learner.network.softmax_code import SoftmaxCode
 from learner.network.vision_input import vision_input
 from learner.network.vmdnn import VMDNN
+from learner.training.asked import Asked
 from learner.training.divergence import add_gradients
-from learner.training.interpolation import Cells, mixed
-from learner.training.sequences import Sequences
+from learner.training.interpolation import NeighbourGrid, mix_sequences
+from learner.training.sequences import Minibatch, Sequences
 from proto.body import ACTION_NAMES
 from proto.config import LearnerConfig
 from proto.episode import Episode, Floats
+from proto.variables import Situation
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class _Material:
-    """All sequences side by side.
+class _Stacked:
+    """All sequences of a `SequenceSet` side by side.
 
     Attributes:
-        sequences: what is seen and the teacher's outputs.
-        spread: (V_S units,) standard deviation of what each unit sees.
+        sequences: what is seen, and the teacher's outputs.
+        deviations: (V_S units,) standard deviation of each unit's activity.
         targets: (S, T, 11) float32, the teacher's actions.
-        cells: whose situations are beside each other.
+        grid: which situations are neighbours.
     """
 
     sequences: Sequences
-    spread: Tensor
+    deviations: Tensor
     targets: Tensor
-    cells: Cells
+    grid: NeighbourGrid
 
 
-class CoupledTraining:
-    """Sequences and loss of coupled training.
+class SequenceSet:
+    """Tutored sequences as a fixed vision sees them, with noise and interpolation.
 
     Attributes:
-        code: how the outputs code actions; fixed, so that all policies of a run agree.
-        parameters: what is trained: everything but the vision.
+        code: how the outputs code actions.
     """
 
     def __init__(
-        self, network: VMDNN, code: SoftmaxCode, config: LearnerConfig, generator: torch.Generator
+        self, see: Callable[[Tensor], Tensor], code: SoftmaxCode, generator: torch.Generator
     ) -> None:
-        """Begin without sequences.
+        """Start without sequences.
 
         Args:
-            network: the network, of which the vision stays as it is.
+            see: V_S (B, T, units) for images (B, T, height, width).
             code: how the outputs code actions.
-            config: how V_S is disturbed, and how often sequences are mixed.
-            generator: draws both.
+            generator: draws noise and mixtures.
         """
         self.code = code
-        self.parameters = network.coupled_parameters()
-        self._network = network
-        self._config = config
+        self._see = see
         self._generator = generator
-        self._situations: list[Mapping[str, float]] = []
+        self._situations: list[Situation] = []
         self._seen: list[Tensor] = []
         self._codes: list[Tensor] = []
         self._targets: list[Floats] = []
-        self._material: _Material | None = None
+        self._stacked: _Stacked | None = None
 
     def __len__(self) -> int:
         return len(self._seen)
 
     def add(self, episode: Episode) -> None:
-        """Take a sequence in; targets outside the code's ranges are learned as their ends."""
+        """Add a sequence; targets outside the code's ranges are learned as the ranges' ends."""
         self._warn_outside(episode)
         images = torch.from_numpy(vision_input(episode.images))
         with torch.no_grad():
-            self._seen.append(self._network.see(images[None])[0])
+            self._seen.append(self._see(images[None])[0])
         self._codes.append(torch.from_numpy(self.code.encode(episode.targets)))
         self._targets.append(episode.targets)
         self._situations.append(episode.situation)
-        self._material = None
+        self._stacked = None
 
-    def add_gradients(self, chosen: Tensor) -> float:
-        """Mean divergence of eq. (5), for the sequences with these indices; adds its gradients."""
-        material = self._all()
-        shift = self._wrongly(len(chosen), material.spread)
-        sequences, share = material.sequences, self._config.interpolation
-        if share:
-            mixtures = material.cells.mixtures(chosen, share, self._generator)
-            sequences = mixed(mixtures, sequences, material.targets, self.code)
-            chosen = torch.arange(len(chosen))
-        return add_gradients(self._network, sequences, chosen, shift)
+    def sequences(self) -> Sequences:
+        """All sequences side by side."""
+        return self._all().sequences
 
-    def _all(self) -> _Material:
-        """Everything taken in, side by side."""
-        if self._material is None:
-            sequences = Sequences.stacked(self._seen, self._codes)
-            self._material = _Material(
-                sequences,
-                spread=sequences.seen.std((0, 1)),
-                targets=pad_sequence(list(map(torch.from_numpy, self._targets)), True),
-                cells=Cells(self._situations, list(map(len, self._seen))),
-            )
-        return self._material
+    def mixed(self, chosen: Tensor, share: float) -> Sequences:
+        """The sequences with these indices, a share of them mixed with their neighbours."""
+        stacked = self._all()
+        mixtures = stacked.grid.mixtures(chosen, share, self._generator)
+        return mix_sequences(mixtures, stacked.sequences, stacked.targets, self.code)
 
-    def _wrongly(self, count: int, spread: Tensor) -> Tensor | None:
-        """How wrongly V_S sees some sequences, each in one way from its start to its end.
+    def vision_noise(self, count: int, amplitude: float) -> Tensor:
+        """Noise (count, units) added to V_S, constant through a sequence.
 
-        The network so learns not to rely on small differences in what it sees.
+        It keeps the network from relying on small differences in what it sees.
+
+        Args:
+            count: number of sequences.
+            amplitude: in standard deviations of each unit's activity.
         """
-        if self._config.vision_noise == 0:
-            return None
-        wrong = torch.randn(count, len(spread), generator=self._generator)
-        return self._config.vision_noise * spread * wrong
+        deviations = self._all().deviations
+        noise = torch.randn(count, len(deviations), generator=self._generator)
+        return amplitude * deviations * noise
 
-    def mean_errors(self) -> NDArray[np.float64]:
-        """(11,) mean distance of the decoded outputs from the targets, over all sequences."""
+    def mean_errors(self, act: Callable[[Tensor], Tensor]) -> NDArray[np.float64]:
+        """(11,) mean distance of decoded outputs from the targets, over all sequences.
+
+        Args:
+            act: logarithms of the outputs (B, T, 11, softmax units) for V_S (B, T, units).
+        """
         errors = []
         with torch.no_grad():
             for seen, targets in zip(self._seen, self._targets, strict=True):
-                outputs = self._network.act(seen[None])[0].exp().numpy()
+                outputs = act(seen[None])[0].exp().numpy()
                 errors.append(np.abs(self.code.decode(outputs) - targets))
         return np.asarray(np.concatenate(errors).mean(0))
 
+    def _all(self) -> _Stacked:
+        if self._stacked is None:
+            sequences = Sequences.stacked(self._seen, self._codes)
+            self._stacked = _Stacked(
+                sequences,
+                deviations=sequences.seen.std((0, 1)),
+                targets=pad_sequence(list(map(torch.from_numpy, self._targets)), True),
+                grid=NeighbourGrid(self._situations, list(map(len, self._seen))),
+            )
+        return self._stacked
+
     def _warn_outside(self, episode: Episode) -> None:
         excess = np.maximum(self.code.minima - episode.targets, episode.targets - self.code.maxima)
-        worst = excess.max(0)
-        for name, amount in zip(ACTION_NAMES, worst, strict=True):
+        for name, amount in zip(ACTION_NAMES, excess.max(0), strict=True):
             if amount > 1e-3:
                 _log.warning(
                     "sequence %s: %s goes %.2f beyond the range that was fixed when coupled"
@@ -144,3 +146,58 @@ class CoupledTraining:
                     name,
                     amount,
                 )
+
+
+class CoupledTraining:
+    """Objective of coupled training: eq. (5) on tutored sequences and mixtures of them.
+
+    Attributes:
+        code: how the outputs code actions; fixed, so that all policies of a run agree.
+        asked: always empty.
+        classifier: always None.
+        parameters: what is trained: everything but the vision.
+    """
+
+    asked: Sequence[Asked] = ()
+    classifier = None
+
+    def __init__(
+        self, network: VMDNN, code: SoftmaxCode, config: LearnerConfig, generator: torch.Generator
+    ) -> None:
+        """Start without sequences.
+
+        Args:
+            network: the network; its vision stays as it is.
+            code: how the outputs code actions.
+            config: amplitude of the vision noise, and how often sequences are mixed.
+            generator: draws both.
+        """
+        self.code = code
+        self.parameters = network.coupled_parameters()
+        self._network = network
+        self._config = config
+        self._set = SequenceSet(network.see, code, generator)
+
+    def __len__(self) -> int:
+        return len(self._set)
+
+    def add(self, episode: Episode) -> None:
+        """Add a sequence."""
+        self._set.add(episode)
+
+    def add_gradients(self, chosen: Tensor) -> float:
+        """Mean divergence of eq. (5), for the sequences with these indices; adds its gradients."""
+        amplitude, share = self._config.vision_noise, self._config.interpolation
+        noise = self._set.vision_noise(len(chosen), amplitude) if amplitude else None
+        if share:
+            minibatch = Minibatch.of_all(self._set.mixed(chosen, share), noise)
+        else:
+            minibatch = Minibatch(self._set.sequences(), chosen, shift=noise)
+        return add_gradients(self._network, minibatch)
+
+    def mean_errors(self) -> NDArray[np.float64]:
+        """(11,) mean distance of the decoded outputs from the targets, over all sequences.
+
+        The network sees the tutor's images, not those that its own actions would lead to.
+        """
+        return self._set.mean_errors(self._network.act)

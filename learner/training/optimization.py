@@ -15,8 +15,12 @@ from proto.episode import Episode
 from proto.errors import UserError
 
 
-class Lesson(Protocol):
-    """Sequences and what is to be learned from them."""
+class Objective(Protocol):
+    """Sequences, and the loss of a network on them.
+
+    Attributes:
+        parameters: what is trained.
+    """
 
     parameters: list[nn.Parameter]
 
@@ -24,26 +28,27 @@ class Lesson(Protocol):
         """Number of sequences."""
 
     def add(self, episode: Episode) -> None:
-        """Take a sequence in."""
+        """Add a sequence."""
 
     def add_gradients(self, chosen: Tensor) -> float:
-        """Mean loss of the sequences with these indices.
+        """Mean loss of some sequences; adds its gradients to the parameters' `grad`.
 
-        Its gradients are added to the parameters' `grad`, as `backward` adds them.
+        Args:
+            chosen: (B,) int64 indices of the sequences.
         """
 
 
 @dataclass(frozen=True)
-class Plan:
-    """How a lesson is learned.
+class Hyperparameters:
+    """Settings of one optimization.
 
     Attributes:
         epochs: how often every sequence is shown.
         rate: learning rate of Adam.
-        schedule: whether the rate stays, or falls to zero as half a cosine.
+        schedule: the rate stays constant, or falls to zero as half a cosine.
         warmup_epochs: epochs in which the rate first rises to its full value.
-        batch: sequences in a minibatch, at most.
-        clip_norm: largest norm of the gradient, or None.
+        batch: most sequences in a minibatch.
+        clip_norm: largest norm of the gradient, or None for no limit.
     """
 
     epochs: int
@@ -61,43 +66,47 @@ class Plan:
 
 
 class Optimization:
-    """Learns a lesson, epoch by epoch."""
+    """Minimizes an objective, epoch by epoch."""
 
-    def __init__(self, lesson: Lesson, plan: Plan) -> None:
-        self._lesson = lesson
-        self._plan = plan
-        self._adam = Adam(lesson.parameters, plan.clip_norm)
+    def __init__(self, objective: Objective, hyperparameters: Hyperparameters) -> None:
+        self._objective = objective
+        self._hyperparameters = hyperparameters
+        self._adam = Adam(objective.parameters, hyperparameters.clip_norm)
 
     def epoch(self, number: int, generator: torch.Generator) -> float:
         """Show every sequence once, in minibatches of nearly equal size; the mean loss.
 
+        Args:
+            number: number of the epoch, from 0 on; sets the learning rate.
+            generator: draws the order of the sequences.
+
         Raises:
             UserError: the training diverged.
         """
-        rate = self._plan.rate_at(number)
+        rate = self._hyperparameters.rate_at(number)
         minibatches = self._minibatches(generator)
         total = sum(self._update(chosen, rate) * len(chosen) for chosen in minibatches)
-        return total / len(self._lesson)
+        return total / len(self._objective)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state of Adam, by parameter and name."""
+        """The state of the optimizer by name; see `Adam.tensors`."""
         return self._adam.tensors()
 
     def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
-        """Take the state that `tensors` gave.
+        """Restore the state from what `tensors` returned.
 
         Raises:
-            KeyError: a part of it is missing.
+            KeyError: a tensor is missing.
         """
         self._adam.load_tensors(tensors)
 
     def _minibatches(self, generator: torch.Generator) -> Iterator[Tensor]:
-        count = len(self._lesson)
+        count = len(self._objective)
         shuffled = torch.randperm(count, generator=generator)
-        return iter(shuffled.tensor_split(math.ceil(count / self._plan.batch)))
+        return iter(shuffled.tensor_split(math.ceil(count / self._hyperparameters.batch)))
 
     def _update(self, chosen: Tensor, rate: float) -> float:
-        loss = self._lesson.add_gradients(chosen)
+        loss = self._objective.add_gradients(chosen)
         if not math.isfinite(loss):
             raise UserError(
                 f"the training diverged (loss {loss}): lower learner.rate or learner.clip_norm,"

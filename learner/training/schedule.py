@@ -1,4 +1,4 @@
-"""How coupled training is divided: a first lap, then one for each round of corrections."""
+"""How coupled training is divided into rounds."""
 
 from __future__ import annotations
 
@@ -6,36 +6,41 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Laps:
-    """Epochs of the laps; each is a training with an optimizer and a schedule of its own.
+class RoundSchedule:
+    """Epochs of the rounds; each round has an optimizer and a learning rate schedule of its own.
+
+    Round 0 is coupled training before any corrections. Rounds 1, 2, ... follow one round of
+    corrections each.
 
     Attributes:
-        first: epochs of the first lap.
-        rounds: number of laps that follow, one for each round of corrections.
-        each: epochs of each of those.
+        initial_epochs: epochs of round 0.
+        rounds: number of rounds of corrections.
+        epochs_per_round: epochs of each later round.
     """
 
-    first: int
+    initial_epochs: int
     rounds: int
-    each: int
+    epochs_per_round: int
 
     @property
     def total(self) -> int:
-        """Epochs of all laps."""
+        """Epochs of all rounds."""
         return self.end_of(self.rounds)
 
     def round_at(self, epoch: int) -> int:
-        """Round, from 1, of the lap that an epoch, from 0, lies in; 0 in the first lap."""
-        return 0 if epoch < self.first else min((epoch - self.first) // self.each + 1, self.rounds)
+        """Round that an epoch, counted from 0, belongs to; later epochs belong to the last one."""
+        if epoch < self.initial_epochs:
+            return 0
+        return min((epoch - self.initial_epochs) // self.epochs_per_round + 1, self.rounds)
 
-    def length_of(self, number: int) -> int:
-        """Epochs of a round's lap."""
-        return self.each if number else self.first
+    def epochs_of(self, number: int) -> int:
+        """Epochs of a round."""
+        return self.epochs_per_round if number else self.initial_epochs
 
     def start_of(self, number: int) -> int:
-        """First epoch of a round's lap."""
-        return self.end_of(number) - self.length_of(number)
+        """First epoch of a round, counted from 0."""
+        return self.end_of(number) - self.epochs_of(number)
 
     def end_of(self, number: int) -> int:
-        """Epochs that are done when a round's lap is over."""
-        return self.first + number * self.each
+        """Epochs done at the end of a round."""
+        return self.initial_epochs + number * self.epochs_per_round

@@ -1,47 +1,43 @@
-"""Training of VMDNN: pre-training of the vision, then coupled training of the rest, in laps.
+"""Training of a network: pre-training, then coupled training in rounds.
 
-    trainer = Trainer(config, TutoringStore(folder))
+    trainer = Trainer(VMDNNRecipe(config, questions), TutoringStore(folder))
     while not trainer.finished:
         trainer.epoch()
     policy = trainer.policy_bytes(version=1)
 
-The same config, seed and sequences give the same network to the last bit, and so does a training
-that was saved and restored in between.
+The same config, seed and sequences give the same network to the last bit, also if the training is
+saved and restored in between.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, Self
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from learner.checkpoint import (
     CLASSIFIER_PREFIX,
     NETWORK_PREFIX,
+    AskedMetadata,
     Checkpoint,
     CheckpointMetadata,
     CodeRanges,
-    Tensors,
+    RivalMetadata,
     TrainingMetadata,
     check_same_network,
     checkpoint_bytes,
     load_checkpoint,
     save_checkpoint,
 )
-from learner.network.softmax_code import SoftmaxCode
-from learner.network.vmdnn import VMDNN
-from learner.training.coupled import CoupledTraining
-from learner.training.optimization import Optimization, Plan
-from learner.training.pretraining import Classes, Pretraining, classes_of
-from learner.training.schedule import Laps
+from learner.tensors import prefixed, to_arrays, to_tensors
+from learner.training.optimization import Optimization
+from learner.training.recipe import Recipe, StageObjective
+from learner.training.schedule import RoundSchedule
 from learner.tutoring.selection import Intake
 from learner.tutoring.store import TutoringStore
-from proto.config import Config
 from proto.episode import Episode
 from proto.errors import UserError
 from proto.metrics import Stage
@@ -53,26 +49,27 @@ _RANDOM_STATE: Final = "random.state"
 class Trainer:
     """Trains one network, epoch by epoch.
 
-    Sequences that come into the store while training goes on are taken in at the next epoch.
+    Each epoch begins with the sequences that have come into the store since the last one.
 
     Attributes:
-        network: the network.
-        stage: that of the last epoch: pre-training or coupled training; or finished.
-        epochs_done: epochs done in this stage, in all laps of it.
+        recipe: the network, and how it is trained.
+        objective: objective of the current stage, or None before its first sequence.
+        stage: stage of the last epoch: pre-training or coupled training; or finished.
+        epochs_done: epochs done in this stage, in all its rounds.
         loss: mean loss of the last epoch, or None before the first.
         version: version of the newest policy, 0 for none yet.
     """
 
+    objective: StageObjective | None
     stage: Stage
     epochs_done: int
     loss: float | None
     _intake: Intake
-    _lesson: Pretraining | CoupledTraining | None
     _optimization: Optimization | None
 
     def __init__(
         self,
-        config: Config,
+        recipe: Recipe,
         store: TutoringStore,
         pretraining_store: TutoringStore | None = None,
         *,
@@ -81,34 +78,31 @@ class Trainer:
         """Start from random weights.
 
         Args:
-            config: everything the training depends on. Its number of threads is set for the whole
-                process.
+            recipe: the network, and how it is trained. The number of threads that its config asks
+                for is set for the whole process.
             store: sequences to learn from.
-            pretraining_store: sequences for pre-training, when they are others (the paper's have
-                no obstacle).
-            rounds: laps that follow the first, after corrections that somebody adds to the store.
+            pretraining_store: sequences for pre-training; without it, those of `store`.
+            rounds: rounds of corrections. The caller adds corrections to the store before each.
         """
+        config = recipe.config
         torch.set_num_threads(config.learner.threads)
-        self._config = config
+        self.recipe = recipe
         self._store = store
-        self._pretraining_store = store if pretraining_store is None else pretraining_store
-        learner = config.learner
-        self._laps = Laps(learner.epochs, rounds, learner.corrections.epochs)
-        self._generator = torch.Generator().manual_seed(config.run.seed)
-        self.network = VMDNN(config.network)
-        self.network.initialize(
-            self._generator,
-            initial_range=config.learner.initial_range,
-            pfc_input_range=config.learner.initial_range_pfc_input,
+        self._pretraining_store, self._pretraining_task = store, config.task.name
+        if pretraining_store is not None:
+            self._pretraining_store = pretraining_store
+            self._pretraining_task = config.pretraining_task or config.task.name
+        self._rounds = RoundSchedule(
+            recipe.coupled_epochs, rounds, config.learner.corrections.epochs
         )
         self.version = 0
-        self._enter(Stage.PRETRAINING if config.learner.pretraining.epochs else Stage.COUPLED)
+        self._enter(Stage.PRETRAINING if recipe.pretraining_epochs else Stage.COUPLED)
 
     @classmethod
     def restore(
         cls,
         path: Path,
-        config: Config,
+        recipe: Recipe,
         store: TutoringStore,
         pretraining_store: TutoringStore | None = None,
         *,
@@ -116,27 +110,39 @@ class Trainer:
     ) -> Self:
         """Go on where `save` was called.
 
+        Args:
+            path: file that `save` wrote.
+            recipe: see `__init__`, also for the other arguments.
+            store: sequences to learn from.
+            pretraining_store: sequences for pre-training.
+            rounds: rounds of corrections.
+
         Raises:
             UserError: the checkpoint is missing, damaged, no training state, or of another network.
         """
         checkpoint = load_checkpoint(path)
-        check_same_network(config.network, checkpoint, f"checkpoint {path}")
-        training = checkpoint.metadata.training
-        if training is None:
+        metadata = checkpoint.metadata
+        check_same_network(recipe.config.network, checkpoint, f"checkpoint {path}")
+        if metadata.rival != recipe.rival:
+            raise UserError(
+                f"checkpoint {path} is of another network: {_kind(metadata.rival)}, not"
+                f" {_kind(recipe.rival)}"
+            )
+        if metadata.training is None:
             raise UserError(
                 f"checkpoint {path} is a policy: it can act, but training cannot go on from it;"
                 " take a training checkpoint"
             )
-        trainer = cls(config, store, pretraining_store, rounds=rounds)
+        trainer = cls(recipe, store, pretraining_store, rounds=rounds)
         try:
-            trainer._resume(checkpoint, training)
+            trainer._resume(checkpoint, metadata.training)
         except (KeyError, RuntimeError) as error:
             raise UserError(f"checkpoint {path} lacks a part of the training: {error}") from error
         return trainer
 
     @property
     def finished(self) -> bool:
-        """Whether all epochs of both stages and all laps are done."""
+        """Whether all epochs of both stages and all rounds are done."""
         return self.stage is Stage.FINISHED
 
     @property
@@ -147,23 +153,24 @@ class Trainer:
 
     @property
     def epochs_total(self) -> int:
-        """Epochs that this stage has, in all laps of it."""
-        pretraining = self._config.learner.pretraining
-        return pretraining.epochs if self.stage is Stage.PRETRAINING else self._laps.total
+        """Epochs of this stage, in all its rounds."""
+        if self.stage is Stage.PRETRAINING:
+            return self.recipe.pretraining_epochs
+        return self._rounds.total
 
     @property
     def round(self) -> int:
-        """Round of corrections, from 1, that the next epoch belongs to; 0 in the first lap."""
-        return 0 if self.stage is Stage.PRETRAINING else self._laps.round_at(self.epochs_done)
+        """Round that the next epoch belongs to; 0 before any corrections and in pre-training."""
+        return 0 if self.stage is Stage.PRETRAINING else self._rounds.round_at(self.epochs_done)
 
     @property
     def round_begins(self) -> bool:
-        """Whether the next epoch is the first after a round of corrections."""
-        return self.round > 0 and self.epochs_done == self._laps.start_of(self.round)
+        """Whether the next epoch is the first one after a round of corrections."""
+        return self.round > 0 and self.epochs_done == self._rounds.start_of(self.round)
 
     @property
     def sequences(self) -> int:
-        """Sequences that this stage learns from."""
+        """Number of sequences that this stage learns from."""
         return len(self._intake.taken)
 
     def epoch(self) -> float:
@@ -177,168 +184,130 @@ class Trainer:
         if self.next_stage is not self.stage:
             self._enter(self.next_stage)
         self._take_in(self._intake.new())
-        if self.round_begins and self._lesson is not None:
-            self._optimization = Optimization(self._lesson, self._plan())
+        if self.round_begins and self.objective is not None:
+            self._optimization = self._new_optimization(self.objective)
         if self._optimization is None:
             raise UserError(self._intake.complaint())
-        in_lap = self.epochs_done - self._laps.start_of(self.round)
-        self.loss = loss = self._optimization.epoch(in_lap, self._generator)
+        number = self.epochs_done - self._rounds.start_of(self.round)
+        self.loss = loss = self._optimization.epoch(number, self.recipe.generator)
         self.epochs_done += 1
         self._finish_if_done()
         return loss
 
-    def mean_errors(self) -> NDArray[np.float64]:
-        """(11,) mean distance of the decoded outputs from the targets, over all sequences.
-
-        The network sees the tutor's pictures here, not what its own actions would show it.
-        """
-        return self._coupled().mean_errors()
-
     def policy_bytes(self, version: int) -> bytes:
-        """The network as a policy of this version, which becomes the newest."""
-        self._coupled()
+        """The network as a policy of this version, which becomes the newest.
+
+        Raises:
+            RuntimeError: the network cannot act before the first epoch of coupled training.
+        """
+        if self.objective is None or self.objective.code is None:
+            raise RuntimeError("the network cannot act before the first epoch of coupled training")
         self.version = version
-        return checkpoint_bytes(Checkpoint(self._metadata(None), _arrays(self._network_parts())))
+        return checkpoint_bytes(Checkpoint(self._metadata(None), to_arrays(self._network_parts())))
 
     def save(self, path: Path) -> None:
-        """Write all that `restore` needs.
+        """Write everything that `restore` needs.
 
         Raises:
             UserError: the file cannot be written there.
         """
-        parts = self._network_parts() | {_RANDOM_STATE: self._generator.get_state()}
+        parts = self._network_parts() | {_RANDOM_STATE: self.recipe.generator.get_state()}
         if self._optimization is not None:
-            parts |= _prefixed(_OPTIMIZER_PREFIX, self._optimization.tensors())
-        if isinstance(self._lesson, Pretraining):
-            parts |= _prefixed(CLASSIFIER_PREFIX, self._lesson.classifier.state_dict())
-        save_checkpoint(path, Checkpoint(self._metadata(self._training_metadata()), _arrays(parts)))
+            parts |= prefixed(_OPTIMIZER_PREFIX, self._optimization.tensors())
+        if self.objective is not None and self.objective.classifier is not None:
+            parts |= prefixed(CLASSIFIER_PREFIX, self.objective.classifier.state_dict())
+        metadata = self._metadata(self._training_metadata())
+        save_checkpoint(path, Checkpoint(metadata, to_arrays(parts)))
 
     def _enter(self, stage: Stage) -> None:
         self.stage = stage
         self.epochs_done = 0
         self.loss = None
-        self._intake = self._make_intake()
-        self._lesson = None
+        self._intake = self._new_intake()
+        self.objective = None
         self._optimization = None
 
     def _finish_if_done(self) -> None:
         if self.stage is Stage.COUPLED and self.epochs_done >= self.epochs_total:
             self.stage = Stage.FINISHED
 
-    def _make_intake(self) -> Intake:
-        image = self._config.network.image
+    def _new_intake(self) -> Intake:
         if self.stage is Stage.PRETRAINING:
-            return Intake(self._pretraining_store, image, self._config.learner.pretraining.labels)
-        return Intake(self._store, image)
+            variables = self.recipe.pretraining_variables
+            return Intake(self._pretraining_store, self._pretraining_task, variables)
+        return Intake(self._store, self.recipe.config.task.name)
 
-    def _plan(self) -> Plan:
-        learner = self._config.learner
-        if self.stage is Stage.PRETRAINING:
-            first = learner.pretraining
-            return Plan(
-                first.epochs, first.rate, learner.schedule, 0, first.batch, learner.clip_norm
-            )
-        return Plan(
-            self._laps.length_of(self.round),
-            learner.rate,
-            learner.schedule,
-            learner.warmup_epochs,
-            learner.batch,
-            learner.clip_norm,
-        )
+    def _new_optimization(self, objective: StageObjective) -> Optimization:
+        pretraining = self.stage is Stage.PRETRAINING
+        epochs = self.epochs_total if pretraining else self._rounds.epochs_of(self.round)
+        return Optimization(objective, self.recipe.hyperparameters(self.stage, epochs))
 
     def _take_in(self, episodes: Sequence[Episode]) -> None:
-        if self._lesson is None and episodes:
-            self._begin(self._first_lesson(episodes))
-        if self._lesson is not None:
+        if self.objective is None and episodes:
+            self._begin(self.recipe.new_objective(self.stage, episodes))
+        if self.objective is not None:
             for episode in episodes:
-                self._lesson.add(episode)
+                self.objective.add(episode)
 
-    def _begin(self, lesson: Pretraining | CoupledTraining) -> Optimization:
-        self._lesson = lesson
-        self._optimization = Optimization(lesson, self._plan())
+    def _begin(self, objective: StageObjective) -> Optimization:
+        self.objective = objective
+        self._optimization = self._new_optimization(objective)
         return self._optimization
-
-    def _first_lesson(self, episodes: Sequence[Episode]) -> Pretraining | CoupledTraining:
-        """The lesson of this stage, its classes or ranges fixed from the first sequences."""
-        if self.stage is Stage.PRETRAINING:
-            labels = self._config.learner.pretraining.labels
-            return self._pretraining(classes_of(episodes, labels))
-        targets = np.concatenate([episode.targets for episode in episodes])
-        code = SoftmaxCode.of_actions(targets, self._config.network)
-        return self._coupled_training(code)
-
-    def _pretraining(self, classes: Classes) -> Pretraining:
-        config = self._config.learner.pretraining
-        return Pretraining(self.network, classes, config, self._generator)
-
-    def _coupled_training(self, code: SoftmaxCode) -> CoupledTraining:
-        return CoupledTraining(self.network, code, self._config.learner, self._generator)
-
-    def _coupled(self) -> CoupledTraining:
-        if not isinstance(self._lesson, CoupledTraining):
-            raise RuntimeError("the network cannot act before the first epoch of coupled training")
-        return self._lesson
 
     def _resume(self, checkpoint: Checkpoint, training: TrainingMetadata) -> None:
         metadata = checkpoint.metadata
-        self.network.load_state_dict(_tensors(checkpoint.part(NETWORK_PREFIX)))
+        self.recipe.network.load_state_dict(to_tensors(checkpoint.part(NETWORK_PREFIX)))
         self._enter(metadata.stage)
         self.version = metadata.version
         self.epochs_done = metadata.epoch
         self.loss = metadata.loss
-        lesson = self._lesson_of(metadata, training)
-        if lesson is not None:
-            self._begin(lesson).load_tensors(_tensors(checkpoint.part(_OPTIMIZER_PREFIX)))
+        objective = self.recipe.restored_objective(metadata)
+        if objective is not None:
+            self._begin(objective).load_tensors(to_tensors(checkpoint.part(_OPTIMIZER_PREFIX)))
             for episode in self._intake.again(training.sequences):
-                lesson.add(episode)
-        if isinstance(lesson, Pretraining):
-            lesson.classifier.load_state_dict(_tensors(checkpoint.part(CLASSIFIER_PREFIX)))
-        self._generator.set_state(_tensors(checkpoint.tensors)[_RANDOM_STATE])
+                objective.add(episode)
+            if objective.classifier is not None:
+                classifier = to_tensors(checkpoint.part(CLASSIFIER_PREFIX))
+                objective.classifier.load_state_dict(classifier)
+        self.recipe.generator.set_state(to_tensors(checkpoint.tensors)[_RANDOM_STATE])
         self._finish_if_done()
 
-    def _lesson_of(
-        self, metadata: CheckpointMetadata, training: TrainingMetadata
-    ) -> Pretraining | CoupledTraining | None:
-        code = metadata.softmax_code()
-        if code is not None:
-            return self._coupled_training(code)
-        return self._pretraining(training.classes) if training.classes else None
-
     def _metadata(self, training: TrainingMetadata | None) -> CheckpointMetadata:
-        code = None
-        if isinstance(self._lesson, CoupledTraining):
-            ranges = self._lesson.code
-            code = CodeRanges(minima=tuple(ranges.minima), maxima=tuple(ranges.maxima))
+        config = self.recipe.config
+        code = None if self.objective is None else self.objective.code
+        ranges = None
+        if code is not None:
+            ranges = CodeRanges(minima=tuple(code.minima), maxima=tuple(code.maxima))
         return CheckpointMetadata(
-            run=self._config.run.name,
+            run=config.run.name,
             version=self.version,
             stage=Stage.PRETRAINING if self.stage is Stage.PRETRAINING else Stage.COUPLED,
             epoch=self.epochs_done,
             loss=self.loss,
-            config_digest=self._config.digest(),
-            network=self._config.network,
-            code=code,
+            config_digest=config.digest(),
+            task=config.task.name,
+            backend=config.simulator.backend,
+            network=config.network,
+            code=ranges,
             cases=len(self._intake.situations),
             sequences=self.sequences,
             training=training,
+            rival=self.recipe.rival,
         )
 
     def _training_metadata(self) -> TrainingMetadata:
-        classes = self._lesson.classes if isinstance(self._lesson, Pretraining) else {}
-        return TrainingMetadata(sequences=tuple(self._intake.taken), classes=dict(classes))
+        asked = () if self.objective is None else self.objective.asked
+        return TrainingMetadata(
+            sequences=tuple(self._intake.taken),
+            asked={
+                each.variable: AskedMetadata(classes=each.classes, window=each.window)
+                for each in asked
+            },
+        )
 
     def _network_parts(self) -> dict[str, Tensor]:
-        return _prefixed(NETWORK_PREFIX, self.network.state_dict())
+        return prefixed(NETWORK_PREFIX, self.recipe.network.state_dict())
 
 
-def _prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {f"{prefix}{name}": tensor for name, tensor in tensors.items()}
-
-
-def _arrays(tensors: Mapping[str, Tensor]) -> dict[str, NDArray[np.generic]]:
-    return {name: tensor.numpy() for name, tensor in tensors.items()}
-
-
-def _tensors(arrays: Tensors) -> dict[str, Tensor]:
-    return {name: torch.tensor(array) for name, array in arrays.items()}
+def _kind(rival: RivalMetadata | None) -> str:
+    return "VMDNN" if rival is None else f"{rival.kind} with {rival.units} units"

@@ -6,75 +6,79 @@ from collections.abc import Callable
 from pathlib import Path
 
 from learner.checkpoint import policy_file, pretraining_file, training_file
+from learner.training.recipe import Recipe
 from learner.training.trainer import Trainer
 from learner.tutoring.store import TutoringStore
-from proto.config import Config, LearnerConfig
 from proto.metrics import Stage
 from proto.storage import written_whole
 
 
 def open_training(
-    config: Config,
+    recipe: Recipe,
     folder: Path,
     store: TutoringStore,
-    pretraining_store: TutoringStore | None,
+    pretraining_store: TutoringStore | None = None,
     *,
     rounds: int = 0,
 ) -> Trainer:
-    """Go on with the training of a run's folder, or start it where there is none.
+    """Go on with the training in a run's folder, or start it if there is none.
 
-    Without actors there are no corrections, so there are no rounds of them unless they are asked
-    for, whatever the configuration says.
+    Args:
+        recipe: the network, and how it is trained.
+        folder: the run's folder.
+        store: sequences to learn from.
+        pretraining_store: sequences for pre-training; without it, those of `store`.
+        rounds: rounds of corrections. The number in the config does not count here: corrections
+            need actors.
 
     Raises:
         UserError: the folder has a training of another network, or a damaged one.
     """
     path = training_file(folder)
     if path.exists():
-        return Trainer.restore(path, config, store, pretraining_store, rounds=rounds)
-    return Trainer(config, store, pretraining_store, rounds=rounds)
+        return Trainer.restore(path, recipe, store, pretraining_store, rounds=rounds)
+    return Trainer(recipe, store, pretraining_store, rounds=rounds)
 
 
-def run_training(
-    trainer: Trainer, config: LearnerConfig, folder: Path, go_on: Callable[[float], bool]
-) -> None:
-    """Train to the end, writing checkpoints and policies as the config says.
+def run_training(trainer: Trainer, folder: Path, go_on: Callable[[float], bool]) -> None:
+    """Train to the end; write checkpoints and policies as the config says.
 
-    A checkpoint is also written when it stops. What is written between two checkpoints is written
-    again, the same, if the process was killed in between.
+    A checkpoint is also written when the training stops. After a kill, everything since the last
+    checkpoint is computed and written again, with the same result.
 
     Args:
-        trainer: what is trained.
-        config: how often to write.
+        trainer: the training.
         folder: the run's folder.
         go_on: called with the loss after each epoch; False stops the training.
     """
+    checkpoint_every = trainer.recipe.config.learner.checkpoint_every_epochs
     going = True
     while going and not trainer.finished:
         going = go_on(trainer.epoch())
         if pretraining_is_over(trainer):
             trainer.save(pretraining_file(folder))
-        if policy_is_due(trainer, config):
+        if policy_is_due(trainer):
             write_policy(trainer, folder)
-        if trainer.epochs_done % config.checkpoint_every_epochs == 0:
+        if trainer.epochs_done % checkpoint_every == 0:
             trainer.save(training_file(folder))
     trainer.save(training_file(folder))
 
 
 def pretraining_is_over(trainer: Trainer) -> bool:
-    """Whether the epoch that was just done was the last one of pre-training."""
+    """Whether the last epoch was the last one of pre-training."""
     return trainer.next_stage is not trainer.stage
 
 
-def policy_is_due(trainer: Trainer, config: LearnerConfig) -> bool:
-    """Whether the epoch that was just done gives a policy.
+def policy_is_due(trainer: Trainer) -> bool:
+    """Whether the last epoch gives a policy.
 
-    In the first lap every so many epochs do, and in all laps the last one.
+    The last epoch of every round does; in round 0 also every `publish_every_epochs`-th epoch.
     """
     if trainer.finished or trainer.round_begins:
         return True
-    first_lap = trainer.stage is Stage.COUPLED and trainer.round == 0
-    return first_lap and trainer.epochs_done % config.publish_every_epochs == 0
+    every = trainer.recipe.publish_every_epochs
+    initial_round = trainer.stage is Stage.COUPLED and trainer.round == 0
+    return initial_round and every is not None and trainer.epochs_done % every == 0
 
 
 def write_policy(trainer: Trainer, folder: Path) -> None:

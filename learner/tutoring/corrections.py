@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 from learner.tutoring.failures import Failures, Shown
@@ -13,12 +13,17 @@ from proto.episode import Kind
 from proto.leases import Leases
 from proto.messages import Correction, EpisodeFailed, PolicyKey, TutoringRequest, Verdict
 from proto.seeds import CORRECTIONS
-
-Situation = Mapping[str, float]
+from proto.variables import Question, Situation
 
 
 class Situations(Protocol):
-    """The situations of a task."""
+    """What the learner must know of a task.
+
+    Attributes:
+        questions: what pre-training asks about its situations.
+    """
+
+    questions: tuple[Question, ...]
 
     def tutored(self) -> Sequence[Situation]:
         """The tutored situations, always in the same order."""

@@ -10,6 +10,7 @@ import numpy as np
 from learner.tutoring.store import TutoringStore
 from proto.episode import Episode, Kind
 from proto.errors import UserError
+from proto.variables import Value
 
 LOG = logging.getLogger(__name__)
 
@@ -23,21 +24,19 @@ class Intake:
         refused: why the other sequences cannot be learned from, by id.
     """
 
-    def __init__(
-        self, store: TutoringStore, image: tuple[int, int], values: Iterable[str] = ()
-    ) -> None:
+    def __init__(self, store: TutoringStore, task: str, variables: Iterable[str] = ()) -> None:
         """Take sequences from `store`.
 
         Args:
             store: the sequences.
-            image: (width, height) that the pictures must have.
-            values: names of values that the situations must have.
+            task: name of the task that they must show.
+            variables: names of the variables that pre-training asks about.
         """
         self._store = store
-        self._image = image
-        self._values = tuple(values)
+        self._task = task
+        self._variables = tuple(variables)
         self.taken: list[str] = []
-        self.situations: set[frozenset[tuple[str, float]]] = set()
+        self.situations: set[frozenset[tuple[str, Value]]] = set()
         self.refused: dict[str, str] = {}
 
     def new(self) -> list[Episode]:
@@ -85,20 +84,20 @@ class Intake:
         return episodes
 
     def _check(self, episode: Episode) -> None:
-        width, height = self._image
+        if episode.task != self._task:
+            raise UserError(
+                f"{episode.id} shows the task {episode.task!r}, not {self._task!r}; take sequences"
+                " of that task, or set task.name (for pre-training: learner.pretraining.task)"
+            )
         if episode.kind not in (Kind.TUTORING, Kind.CORRECTION):
             raise UserError(f"{episode.id} is a {episode.kind} episode, not a tutored one")
-        if episode.steps == 0 or episode.images.shape[1:] != (height, width):
-            raise UserError(
-                f"{episode.id} has pictures {episode.images.shape}, not (steps, {height}, {width})"
-                " as network.image says"
-            )
+        if episode.steps == 0:
+            raise UserError(f"{episode.id} has no steps")
         if not np.isfinite(episode.targets).all():
             raise UserError(f"{episode.id} has targets that are not finite numbers")
-        for value in self._values:
-            if value not in episode.situation:
+        for variable in self._variables:
+            if variable not in episode.situation:
                 raise UserError(
-                    f"{episode.id} has no {value!r} in its situation, which"
-                    " learner.pretraining.labels asks for; it has"
-                    f" {', '.join(sorted(episode.situation))}"
+                    f"{episode.id} has no {variable!r} in its situation, which pre-training asks"
+                    f" for; it has {', '.join(sorted(episode.situation))}"
                 )

@@ -8,8 +8,8 @@
 | `/states` | vmdnn.States | states[t] of each subnet; only where they were asked for |
 | `/step` | vmdnn.Step | phases[t], actions[t], targets[t], outputs[t]; ends step t |
 
-Step t is logged at t control periods. Everything else stands in three metadata records before
-the first message: `episode`, `situation` and `outcome`.
+Step t is logged at t control periods. Everything else stands in four metadata records before the
+first message: `episode`, `situation`, `outcome` and `measures`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import json
 import struct
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,8 +34,9 @@ from numpy.typing import NDArray
 from zstandard import ZstdError
 
 from proto.body import ACTION_NAMES, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
-from proto.episode import Episode, Floats, Image, Kind, Outcome, Reason
+from proto.episode import Episode, Floats, Image, Kind, Measure, Outcome
 from proto.errors import UserError
+from proto.recordings import format1
 from proto.recordings.schemas import (
     CompressedImage,
     FrameTransforms,
@@ -47,7 +48,8 @@ from proto.recordings.schemas import (
 )
 from proto.storage import written_whole
 
-FORMAT: Final = "1"
+FORMAT: Final = 2
+"""Format of the files that are written; those of format 1 can be read, too."""
 EYE: Final = "/eye"
 JOINTS: Final = "/joints"
 TRANSFORMS: Final = "/tf"
@@ -59,6 +61,8 @@ TOPICS: Final[Mapping[str, type[Message]]] = {
     TRANSFORMS: FrameTransforms,
     STEP: Step,
 }
+
+_READINGS: Final = ("lenient", "strict", "precise")
 
 # A kill while an episode is written costs at most one chunk, some ten steps.
 CHUNK_BYTES: Final = 64 * 1024
@@ -86,6 +90,7 @@ def write_episode(path: Path, episode: Episode) -> None:
         writer.add_metadata("episode", _episode_texts(episode))
         writer.add_metadata("situation", {k: json.dumps(v) for k, v in episode.situation.items()})
         writer.add_metadata("outcome", _outcome_texts(episode.outcome))
+        writer.add_metadata("measures", _measure_texts(episode.outcome))
         topics = dict(TOPICS) if episode.states is None else {**TOPICS, STATES: States}
         channels = {topic: _register(writer, topic, schema) for topic, schema in topics.items()}
         for step in range(episode.steps):
@@ -108,6 +113,7 @@ def read_episode(path: Path, *, partial: bool = False) -> Episode:
         UserError: the file is missing, cut off, damaged, no episode, or recovered in part.
     """
     contents = _contents(path)
+    _check_format(path, contents)
     try:
         expected = int(contents.metadata["episode"]["steps"])
         episode = _episode(contents)
@@ -229,7 +235,8 @@ def _messages(episode: Episode, step: int, time_ns: int) -> Iterator[tuple[str, 
         at.x, at.y, at.z, turn.w, turn.x, turn.y, turn.z = pose
     told = Step(
         step=step,
-        phase=int(episode.phases[step]),
+        phase=int(episode.phases[step]) + 1,
+        phase_name=episode.phase_names[episode.phases[step]],
         action=dict(zip(ACTION_NAMES, episode.actions[step].tolist(), strict=True)),
         target=dict(zip(ACTION_NAMES, episode.targets[step].tolist(), strict=True)),
         outputs=[] if episode.outputs is None else episode.outputs[step].tolist(),
@@ -247,8 +254,6 @@ def _messages(episode: Episode, step: int, time_ns: int) -> Iterator[tuple[str, 
 
 def _episode(contents: _Contents) -> Episode:
     told = contents.metadata["episode"]
-    if told["format"] != FORMAT:
-        raise ValueError(f"format {told['format']}, not {FORMAT}")
     names = tuple(json.loads(told["body_names"]))
     # `/step` ends a step, so each of its messages stands for a whole one.
     steps = [Step.FromString(data) for data in contents.messages[STEP]]
@@ -269,10 +274,11 @@ def _episode(contents: _Contents) -> Episode:
         actions=_floats([_action(step.action) for step in steps], (count, len(ACTION_NAMES))),
         targets=_floats([_action(step.target) for step in steps], (count, len(ACTION_NAMES))),
         joints_deg=_joints_deg(contents.messages[JOINTS][:count]),
-        phases=np.array([step.phase for step in steps], dtype=np.uint8),
+        phase_names=_phase_names(told),
+        phases=np.array([step.phase - 1 for step in steps], dtype=np.uint8),
         body_names=names,
         body_poses=_poses(contents.messages[TRANSFORMS][:count], len(names)),
-        outcome=_outcome(contents.metadata["outcome"]),
+        outcome=_outcome(contents.metadata),
         outputs=None
         if outputs_size is None
         else _floats([step.outputs for step in steps], (count, outputs_size)),
@@ -284,7 +290,7 @@ def _episode(contents: _Contents) -> Episode:
 
 def _episode_texts(episode: Episode) -> dict[str, str]:
     return {
-        "format": FORMAT,
+        "format": str(FORMAT),
         "id": episode.id,
         "kind": episode.kind.value,
         "task": episode.task,
@@ -297,6 +303,7 @@ def _episode_texts(episode: Episode) -> dict[str, str]:
         "config_digest": episode.config_digest,
         "control_period_s": repr(episode.control_period_s),
         "steps": str(episode.steps),
+        "phase_names": json.dumps(episode.phase_names),
         **_states_text(episode),
         "outputs": json.dumps(None if episode.outputs is None else episode.outputs.shape[1]),
         "body_names": json.dumps(episode.body_names),
@@ -312,15 +319,51 @@ def _states_text(episode: Episode) -> dict[str, str]:
 
 
 def _outcome_texts(outcome: Outcome) -> dict[str, str]:
-    texts = {item.name: json.dumps(getattr(outcome, item.name)) for item in fields(Outcome)}
-    return texts | {"reason": outcome.reason.value}
+    readings = {name: json.dumps(getattr(outcome, name)) for name in _READINGS}
+    return readings | {"reason": outcome.reason}
 
 
-def _outcome(texts: Mapping[str, str]) -> Outcome:
-    values: dict[str, Any] = {
-        item.name: json.loads(texts[item.name]) for item in fields(Outcome) if item.name != "reason"
+def _measure_texts(outcome: Outcome) -> dict[str, str]:
+    return {
+        name: json.dumps([measure.value, measure.unit])
+        for name, measure in outcome.measures.items()
     }
-    return Outcome(reason=Reason(texts["reason"]), **values)
+
+
+def _outcome(metadata: Mapping[str, Mapping[str, str]]) -> Outcome:
+    texts = metadata["outcome"]
+    if _format_of(metadata) == 1:
+        reason = {"reason": texts["reason"]}
+        return format1.outcome_of(
+            {k: json.loads(v) for k, v in texts.items() if k != "reason"} | reason
+        )
+    lenient, strict, precise = (bool(json.loads(texts[name])) for name in _READINGS)
+    measured = ((name, json.loads(text)) for name, text in metadata["measures"].items())
+    measures = {name: Measure(float(value), str(unit)) for name, (value, unit) in measured}
+    return Outcome(lenient, strict, precise, texts["reason"], measures)
+
+
+def _phase_names(told: Mapping[str, str]) -> tuple[str, ...]:
+    if told["format"] == "1":
+        return format1.phase_names()
+    return tuple(str(name) for name in json.loads(told["phase_names"]))
+
+
+def _check_format(path: Path, contents: _Contents) -> None:
+    """Refuse a file of a format that this version does not know."""
+    try:
+        number = _format_of(contents.metadata)
+    except (KeyError, ValueError):
+        return  # it is no episode, which is told where it is read
+    if number > FORMAT:
+        raise UserError(
+            f"{path} is of format {number}, written by a newer vmdnn; this one reads formats up to"
+            f" {FORMAT}: update vmdnn to read it"
+        )
+
+
+def _format_of(metadata: Mapping[str, Mapping[str, str]]) -> int:
+    return int(metadata["episode"]["format"])
 
 
 def _png(image: Image) -> bytes:

@@ -60,6 +60,7 @@ def _step_file() -> FileDescriptorProto:
             _field(3, "action", FieldDescriptorProto.TYPE_MESSAGE, ".vmdnn.Action"),
             _field(4, "target", FieldDescriptorProto.TYPE_MESSAGE, ".vmdnn.Action"),
             outputs,
+            _field(6, "phase_name", FieldDescriptorProto.TYPE_STRING),
         ],
     )
     return FileDescriptorProto(
@@ -87,7 +88,8 @@ def _states_file() -> FileDescriptorProto:
 Default().Add(_step_file())
 Default().Add(_states_file())
 Step: Final = message_factory.GetMessageClass(Default().FindMessageTypeByName("vmdnn.Step"))
-"""One control step: `step`, `phase`, `action` and `target` (units of `proto.body`), `outputs`."""
+"""One control step: `step`, `action` and `target` (units of `proto.body`), `outputs`, and the phase
+by number, from 1, (`phase`) and by name (`phase_name`)."""
 States: Final = message_factory.GetMessageClass(Default().FindMessageTypeByName("vmdnn.States"))
 """One control step of a network: `subnets`, each with its `name` and `activity`."""
 

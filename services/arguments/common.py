@@ -7,17 +7,25 @@ import logging
 import os
 import re
 from collections.abc import Callable, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
 from proto.config import Config, load_config
+from proto.errors import UserError
 
 LARGEST_SEED: Final = 2**32 - 1
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     """Add --config and --set."""
-    parser.add_argument("--config", type=Path, help="YAML file; without it, all defaults")
+    parser.add_argument(
+        "--config",
+        type=_config_argument,
+        metavar="FILE|NAME",
+        help="YAML file, or a built-in configuration: experiment1, paper, smoke; without it, all"
+        " defaults",
+    )
     parser.add_argument(
         "--set",
         dest="overrides",
@@ -42,6 +50,30 @@ def add_process(parser: argparse.ArgumentParser) -> None:
     """Add --config, --set, --connect and --id, for a process on the bus."""
     add_connection(parser)
     parser.add_argument("--id", type=_id, help="name of this process on the bus")
+
+
+def config_file(name: str) -> Path:
+    """The file of a configuration: a path, or the name of one that comes with vmdnn.
+
+    Raises:
+        UserError: there is neither a file nor a built-in configuration of this name.
+    """
+    path = Path(name)
+    if path.exists() or path.suffix or path.name != name:
+        return path
+    built_in = {file.stem: file for file in Path(str(files("deploy")), "config").glob("*.yaml")}
+    if name not in built_in:
+        raise UserError(
+            f"config file {name} does not exist; built in are: {', '.join(sorted(built_in))}"
+        )
+    return built_in[name]
+
+
+def _config_argument(name: str) -> Path:
+    try:
+        return config_file(name)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def config_of(arguments: argparse.Namespace) -> Config:

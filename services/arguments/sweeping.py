@@ -1,4 +1,4 @@
-"""What the commands share that train and test many networks: arguments, progress, Ctrl-C."""
+"""What the commands that train and test many networks share: arguments, progress, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from learner.tutoring.store import TutoringStore
 from services.arguments.common import positive, seed
 from services.arguments.training import interruption
 from services.terminal.progress import progress_bar
-from services.trials import sweeps as sweep
+from services.trials import sweeps
 from services.trials.success import READINGS, Tally
-from services.trials.sweeps import Member, Tested, Variant
+from services.trials.sweeps import RunOutcomes, SweepRun, Variant
 
 Stores = tuple[TutoringStore, TutoringStore | None]
-"""Sequences for coupled training, and those for pre-training if they are others."""
+"""Sequences for coupled training, and those for pre-training or None for the same."""
 
 
 def add_sweep(parser: argparse.ArgumentParser, *, trials: int) -> None:
-    """Add --seeds, --trials and --trial-seed; `trials` is how many there are by default."""
+    """Add --seeds, --trials (with this default) and --trial-seed."""
     parser.add_argument(
         "--seeds", type=seed, nargs="+", default=[1, 2, 3], help="seeds of the trainings"
     )
@@ -38,26 +38,26 @@ def run_sweep(
     variants: Sequence[Variant],
     work: Path,
     stores_of: Callable[[Variant], Stores],
-) -> list[Tested]:
-    """Train and test what is missing in a folder, with progress bars; every network that there is.
+) -> list[RunOutcomes]:
+    """Train and test the networks that a folder lacks, with progress bars; the results of all.
 
     Args:
-        arguments: those of `add_sweep` and `options.add_playing`.
+        arguments: those of `add_sweep` and `common.add_playing`.
         variants: what is trained and tested, each with every seed.
         work: the folder.
-        stores_of: the sequences that a variant learns from.
+        stores_of: gives the sequences that a variant learns from.
 
     Raises:
         KeyboardInterrupt: Ctrl-C was pressed; what was done is in the folder.
     """
-    members = sweep.members_of(variants, arguments.seeds, work)
+    runs = sweeps.open_runs(variants, arguments.seeds, work)
     console = Console(stderr=True)
     tested = []
     try:
-        for number, member in enumerate(members, 1):
-            name = f"{member.variant.name}, seed {member.seed} ({number} of {len(members)})"
-            _train(member, stores_of, name)
-            tested.append(_test(member, arguments, name))
+        for number, run in enumerate(runs, 1):
+            name = f"{run.variant.name}, seed {run.seed} ({number} of {len(runs)})"
+            _train(run, stores_of, name)
+            tested.append(_play_trials(run, arguments, name))
             console.print(f"{name}: {_counts(tested[-1])}", highlight=False)
     except KeyboardInterrupt:
         console.print(f"stopped; the same command goes on with what is in {work}")
@@ -65,11 +65,11 @@ def run_sweep(
     return tested
 
 
-def _train(member: Member, stores_of: Callable[[Variant], Stores], name: str) -> None:
-    done, total = sweep.epochs_done(member), sweep.epochs_of(member)
+def _train(run: SweepRun, stores_of: Callable[[Variant], Stores], name: str) -> None:
+    done, total = sweeps.epochs_done(run), sweeps.epochs_total(run)
     if done == total:
         return
-    stores = stores_of(member.variant)
+    stores = stores_of(run.variant)
     with interruption() as interrupted, progress_bar(f"{name}: training", total) as advance:
 
         def go_on(_loss: float) -> bool:
@@ -78,14 +78,14 @@ def _train(member: Member, stores_of: Callable[[Variant], Stores], name: str) ->
 
         for _ in range(done):
             advance()
-        if not sweep.train(member, *stores, go_on):
+        if not sweeps.train(run, *stores, go_on):
             raise KeyboardInterrupt
 
 
-def _test(member: Member, arguments: argparse.Namespace, name: str) -> Tested:
+def _play_trials(run: SweepRun, arguments: argparse.Namespace, name: str) -> RunOutcomes:
     with progress_bar(f"{name}: trials", arguments.trials) as advance:
-        return sweep.test(
-            member,
+        return sweeps.play_trials(
+            run,
             arguments.trials,
             arguments.trial_seed,
             workers=arguments.workers,
@@ -93,7 +93,7 @@ def _test(member: Member, arguments: argparse.Namespace, name: str) -> Tested:
         )
 
 
-def _counts(tested: Tested) -> str:
+def _counts(tested: RunOutcomes) -> str:
     tally = Tally.of(tested.outcomes)
     counts = ", ".join(f"{reading} {tally.successes[reading]}" for reading in READINGS)
     return f"{counts} of {tally.trials}"

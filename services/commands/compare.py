@@ -1,4 +1,4 @@
-"""`vmdnn compare`: VMDNN beside other networks, on the same sequences and situations."""
+"""`vmdnn compare`: train and test VMDNN and other networks on the same data."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--work",
         type=Path,
         required=True,
-        help="folder of the networks and their trials, where the same command goes on",
+        help="folder of the networks and their trials; the same command goes on with it",
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train and test what is missing, then print how each network did."""
+    """Train and test what is missing, then print the results of each network."""
     config = playing_config(arguments)
     stores = training_stores(arguments)
 
@@ -54,18 +54,18 @@ def run(arguments: argparse.Namespace) -> int:
 
     contenders = comparison.variants(config, arguments.only)
     tested = run_sweep(arguments, contenders, arguments.work, stores_of)
-    found = comparison.standings(tested)
+    scores = comparison.scores(tested)
     if arguments.json:
-        print(json.dumps(comparison.numbers(found)))
+        print(json.dumps(comparison.numbers(scores)))
     else:
-        Console().print(comparison.table(found))
+        Console().print(comparison.table(scores))
     return 0
 
 
 def _tutored_again(
     stores: Stores, variant: Variant, config: Config, arguments: argparse.Namespace
 ) -> Stores:
-    """The same sequences as the robot sees them that keeps its head and focus still."""
+    """The same tutoring repeated by a robot that does not move its head and focus."""
 
     def again(store: TutoringStore, name: str) -> TutoringStore:
         folder = arguments.work / f"{variant.name}_{name}"

@@ -16,12 +16,13 @@ from actors.tasks.registry import make_task
 from proto.config import Config
 from proto.errors import UserError
 from proto.storage import written_whole
+from proto.variables import parse_situation
 from services.arguments.common import add_config, add_playing, playing_config, positive, seed
 from services.playing.video import write_video
 from services.playing.workers import Job, play_all
 from services.terminal.progress import progress_bar
 from services.terminal.tables import success_table
-from services.trials.evaluation import parse_situation, result_json, situation_jobs, trial_jobs
+from services.trials.evaluation import result_json, situation_jobs, trial_jobs
 from services.trials.success import Tally
 from services.trials.trial_log import CountedTrial
 
@@ -33,8 +34,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--policy",
         required=True,
-        help="pretrained:experiment1, tutor, replay, yaw-blind, obstacle-blind, lookup, or a"
-        " checkpoint's file",
+        help="tutor, a baseline of the task (`vmdnn inspect task` lists them), pretrained:NAME, a"
+        " checkpoint's file, or a class of your own as package.module:Class",
     )
     parser.add_argument("--trials", type=positive, default=52, help="how many situations")
     parser.add_argument(
@@ -44,8 +45,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--situation",
         action="append",
         metavar="NAME=VALUE,...",
-        help="play this situation instead of those of the seed, such as"
-        " obstacle_x_m=-0.27,object_y_m=0.25,object_yaw_deg=44; may be repeated",
+        help="play this situation instead of those of the seed; `vmdnn inspect task` lists the"
+        " variables; may be repeated",
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     parser.add_argument("--outcomes", type=Path, help="file for one line of JSON a trial")
@@ -91,9 +92,10 @@ def _jobs(config: Config, arguments: argparse.Namespace) -> list[Job]:
     if arguments.situation is None:
         jobs = trial_jobs(config, arguments.trials, arguments.seed, arguments.out)
     else:
-        situations = [parse_situation(text) for text in arguments.situation]
-        for situation in situations:
-            make_task(config.task).check(situation)
+        task = make_task(config.task)
+        situations = [
+            parse_situation(text, task.variables, task.name) for text in arguments.situation
+        ]
         jobs = situation_jobs(situations, arguments.seed, arguments.out)
     return [replace(job, states=arguments.states) for job in jobs]
 

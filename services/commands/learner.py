@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from functools import partial
 
-from actors.tasks.registry import TASKS
+from actors.tasks.registry import make_task
 from learner.learner import Learner
+from proto.bus import Bus
+from proto.config import Config
 from proto.keys import Role
+from proto.lifecycle import Lifecycle
 from services.arguments.common import add_process
 from services.arguments.process import run_process
 
@@ -19,5 +21,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Learn until told to stop."""
-    tasks = {name: task() for name, task in TASKS.items()}
-    return run_process(arguments, Role.LEARNER, partial(Learner, tasks=tasks))
+    return run_process(arguments, Role.LEARNER, _make_learner)
+
+
+def _make_learner(config: Config, bus: Bus, lifecycle: Lifecycle) -> Learner:
+    """A learner that knows the task and that of pre-training."""
+    names = filter(None, (config.task.name, config.pretraining_task))
+    tasks = {name: make_task(config.task_called(name)) for name in names}
+    return Learner(config, bus, lifecycle, tasks=tasks)

@@ -12,9 +12,12 @@ from typing import Final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from actors.tasks.registry import make_pretraining_task, make_task
 from learner.checkpoint import policy_file, training_file
+from learner.training.coupled import CoupledTraining
 from learner.training.trainer import Trainer
 from learner.training.training_run import open_training, run_training
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from proto.body import ARM, FOCUS, GRASP, NECK
 from proto.metrics import Stage
 from services.arguments.common import add_config, config_of
@@ -26,7 +29,7 @@ _LINE_PERIOD_S: Final = 5.0
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
-    parser.epilog = "There are no actors here, so learner.corrections makes no difference."
+    parser.epilog = "Corrections need actors, so learner.corrections has no effect here."
     add_config(parser)
     add_training_data(parser)
     parser.add_argument(
@@ -35,11 +38,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train until done or Ctrl-C; either way the run's folder holds all that was learned."""
+    """Train to the end or until Ctrl-C; the run's folder then holds everything learned."""
     config = config_of(arguments)
     store, others = training_stores(arguments)
     folder: Path = arguments.out
-    trainer = open_training(config, folder, store, others)
+    task = make_task(config.task) if others is None else make_pretraining_task(config)
+    trainer = open_training(VMDNNRecipe(config, task.questions), folder, store, others)
     config.save(folder / "config.yaml")
     if trainer.finished:
         print(f"{folder} is trained already; learner.epochs above {trainer.epochs_done} goes on")
@@ -50,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
             show(loss)
             return not interrupted()
 
-        run_training(trainer, config.learner, folder, go_on)
+        run_training(trainer, folder, go_on)
     if not trainer.finished:
         print(f"stopped; the same command goes on from {training_file(folder)}")
         return _INTERRUPTED
@@ -60,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _progress(trainer: Trainer) -> Iterator[Callable[[float], None]]:
-    """Show each epoch: a bar on a terminal, a line now and then elsewhere."""
+    """Show each epoch: with a bar on a terminal, elsewhere with a line every few seconds."""
     console = Console()
     if not console.is_terminal:
         yield _line_printer(trainer)
@@ -113,7 +117,10 @@ def _stage(trainer: Trainer) -> Stage:
 
 
 def _print_summary(trainer: Trainer, folder: Path) -> None:
-    errors = trainer.mean_errors()
+    objective = trainer.objective
+    if not isinstance(objective, CoupledTraining):
+        raise TypeError("a finished training has the objective of coupled training")
+    errors = objective.mean_errors()
     print(
         f"trained on {trainer.sequences} sequences: loss {trainer.loss:.5f}; mean error with the"
         f" tutor's pictures: neck {errors[NECK].mean():.2f} deg, arm {errors[ARM].mean():.2f} deg,"

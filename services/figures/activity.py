@@ -20,6 +20,7 @@ from learner.network.subnets import ACTIVATION_GAIN
 from proto.body import ACTION_NAMES, ARM, FOCUS, GRASP, NECK
 from proto.episode import Episode, Floats, States
 from proto.errors import UserError
+from proto.variables import Value
 from services.figures.style import BLACK, look, words_and_unit
 
 SUBNETS: Final[Mapping[str, str]] = {"mstnn_fast": "V_F", "pfc": "PFC", "mtrnn_fast": "M_F"}
@@ -247,8 +248,10 @@ def _titles(activities: Sequence[Activity]) -> list[str]:
     return [", ".join(_told(name, situation[name]) for name in told) for situation in situations]
 
 
-def _told(name: str, value: float) -> str:
+def _told(name: str, value: Value) -> str:
     words, unit = words_and_unit(name)
+    if isinstance(value, str):
+        return f"{words} {value}"
     return f"{words} {value:g}°" if unit == "degrees" else f"{words} {value:g} {unit}".rstrip()
 
 
@@ -281,7 +284,7 @@ def _numbers_of(activity: Activity, shown: Mapping[str, NDArray[np.int64]]) -> d
         "policy": episode.policy,
         "policy_version": episode.policy_version,
         "situation": dict(episode.situation),
-        "reason": episode.outcome.reason.value,
+        "reason": episode.outcome.reason,
         "phase_starts": activity.phase_starts[:-1].tolist(),
         "change_per_step": change_per_step(activity),
         "activity": {

@@ -1,4 +1,4 @@
-"""Success against the number of tutored cases, as corrections come in round by round."""
+"""Success against the number of tutored cases, after each round of corrections."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from services.figures.style import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, look, percent
-from services.trials.round_trials import LapEnd, Run
+from services.terminal.rates import rate_text
+from services.trials.round_trials import RoundPolicy, Run
 from services.trials.success import Tally
 
 READINGS: Final = ("strict", "precise")
@@ -23,11 +24,11 @@ _MARKERS: Final = "osD^vPX"
 
 @dataclass(frozen=True)
 class Curve:
-    """What was counted of one run.
+    """Counted trials of one run.
 
     Attributes:
         run: the run.
-        tallies: one for each of `run.lap_ends`.
+        tallies: one for each of `run.policies`.
     """
 
     run: Run
@@ -35,14 +36,14 @@ class Curve:
 
     @property
     def choose(self) -> str:
-        """In which situations the run was corrected; `none` if it was not."""
+        """How situations were chosen for corrections; `none` without corrections."""
         corrections = self.run.config.learner.corrections
         return corrections.choose if corrections.rounds else "none"
 
     @property
-    def points(self) -> Sequence[tuple[LapEnd, Tally]]:
-        """Each policy and what was counted of it."""
-        return list(zip(self.run.lap_ends, self.tallies, strict=True))
+    def points(self) -> Sequence[tuple[RoundPolicy, Tally]]:
+        """Each policy and its counted trials."""
+        return list(zip(self.run.policies, self.tallies, strict=True))
 
 
 def numbers(curves: Sequence[Curve]) -> dict[str, Any]:
@@ -52,7 +53,7 @@ def numbers(curves: Sequence[Curve]) -> dict[str, Any]:
             {
                 "run": str(curve.run.folder),
                 "choose": curve.choose,
-                "policies": [_numbers_of(lap_end, tally) for lap_end, tally in curve.points],
+                "policies": [_numbers_of(policy, tally) for policy, tally in curve.points],
             }
             for curve in curves
         ]
@@ -65,13 +66,13 @@ def table(curves: Sequence[Curve]) -> Table:
     for heading in ("run", "round", "cases", *READINGS):
         result.add_column(heading, justify="left" if heading == "run" else "right")
     for curve in curves:
-        for lap_end, tally in curve.points:
-            first = lap_end is curve.run.lap_ends[0]
+        for policy, tally in curve.points:
+            first = policy is curve.run.policies[0]
             result.add_row(
                 f"{curve.run.config.run.name}: {curve.choose}" if first else "",
-                str(lap_end.round),
-                str(lap_end.cases),
-                *(_text(tally, reading) for reading in READINGS),
+                str(policy.round),
+                str(policy.cases),
+                *(rate_text(tally.rate(reading)) for reading in READINGS),
             )
         result.add_section()
     return result
@@ -98,14 +99,14 @@ def draw(curves: Sequence[Curve]) -> Figure:
 
 def _draw_curve(axes: Axes, curve: Curve, reading: str, **look_of: Any) -> None:
     middle, reach = percent(tally.rate(reading) for tally in curve.tallies)
-    cases = [lap_end.cases for lap_end in curve.run.lap_ends]
+    cases = [policy.cases for policy in curve.run.policies]
     axes.errorbar(
         cases, middle, yerr=reach, linewidth=1.0, markersize=4, elinewidth=0.9, capsize=2, **look_of
     )
 
 
 def _labels(curves: Sequence[Curve]) -> list[str]:
-    """What was corrected in each run, and its name where that does not tell it from others."""
+    """How each run was corrected, with the name of the run where two were corrected alike."""
     count = Counter(curve.choose for curve in curves)
     return [
         curve.choose
@@ -115,17 +116,11 @@ def _labels(curves: Sequence[Curve]) -> list[str]:
     ]
 
 
-def _numbers_of(lap_end: LapEnd, tally: Tally) -> Mapping[str, Any]:
+def _numbers_of(policy: RoundPolicy, tally: Tally) -> Mapping[str, Any]:
     return {
-        "round": lap_end.round,
-        "policy_version": lap_end.version,
-        "cases": lap_end.cases,
-        "sequences": lap_end.sequences,
+        "round": policy.round,
+        "policy_version": policy.version,
+        "cases": policy.cases,
+        "sequences": policy.sequences,
         **tally.as_json(),
     }
-
-
-def _text(tally: Tally, reading: str) -> str:
-    rate = tally.rate(reading)
-    low, high = rate.wilson95
-    return f"{100 * rate.rate:.1f} ({100 * low:.0f} to {100 * high:.0f})"

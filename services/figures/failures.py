@@ -6,9 +6,9 @@ one. Then it errs most midway between two of them, and its errors follow a saw-t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise
+from itertools import combinations, cycle, pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from actors.tasks.contract import Task
-from actors.tasks.experiment1 import task as experiment1
-from proto.episode import Outcome, Reason
+from actors.tasks.contract import FigureWords, GraspError, Task
+from proto.episode import NO_FAILURE, Outcome
 from proto.errors import UserError
+from proto.variables import Discrete, Situation, Value, Variable
 from services.figures.style import (
     BLACK,
     BLUE,
@@ -35,37 +35,17 @@ from services.figures.style import (
     percent,
     words_and_unit,
 )
+from services.terminal.rates import rate_text
 from services.trials.success import Rate
 from services.trials.trial_log import CountedTrial
 
 Array = NDArray[np.float64]
 
-YAW: Final = "object_yaw_deg"
-POSITION: Final = "object_y_m"
 READINGS: Final = ("strict", "precise")
-REASONS: Final[Mapping[Reason, tuple[str, str, str]]] = {
-    Reason.NONE: ("precise", GREEN, "o"),
-    Reason.IMPRECISE: ("strict, not precise", ORANGE, "o"),
-    Reason.NOT_LIFTED: ("not lifted", BLUE, "^"),
-    Reason.NEVER_CLOSED: ("never closed", BLACK, "x"),
-    Reason.MOVED_OBJECT: ("moved the object", RED, "s"),
-    Reason.TOUCHED_OBSTACLE: ("touched the obstacle", PINK, "D"),
-}
-"""What to call each reason, its colour and its marker."""
-ERRORS: Final[Mapping[str, tuple[str, float]]] = {
-    "yaw_error_deg": ("yaw error\n(degrees)", experiment1.YAW_ERROR_DEG),
-    "along_mm": ("offset along\n(mm)", experiment1.ALONG_MM),
-    "across_mm": ("offset across\n(mm)", experiment1.ACROSS_MM),
-    "position_mm": ("offset in Y\n(mm)", experiment1.ALONG_MM),
-}
-"""The errors at the grasp: what to call each, and about how large it may be."""
 SHOWN: Final = 2.5
 """Errors are shown up to so many times what they may be; beyond, the hand was elsewhere."""
-SAW_TEETH: Final[Mapping[str, tuple[str, float]]] = {
-    YAW: ("yaw_error_deg", 1.0),
-    POSITION: ("position_mm", 1e3),
-}
-"""The error that shows snapping to each value, and its unit in that of the value."""
+_MARKS: Final = ((GREEN, "o"), (ORANGE, "o"), (BLUE, "^"), (BLACK, "x"), (RED, "s"), (PINK, "D"))
+"""Colours and markers of the task's reasons, in their order; they repeat if there are more."""
 _Z95: Final = 1.96
 _EXPLANATION: Final = (
     "Dotted: tutored values. Errors are those of trials in which the object was still in its place"
@@ -75,18 +55,53 @@ _EXPLANATION: Final = (
 
 
 @dataclass(frozen=True)
+class Axis:
+    """A variable of the task as an axis of the figure.
+
+    Attributes:
+        variable: the variable.
+        values: (N,) its value in each trial; of a discrete variable the number of the choice.
+        tutored: its tutored values, in order.
+    """
+
+    variable: Variable
+    values: Array
+    tutored: Array
+
+    @classmethod
+    def of(cls, variable: Variable, trials: Sequence[CountedTrial], task: Task) -> Axis:
+        """The axis of a variable."""
+
+        def number(value: Value) -> float:
+            if isinstance(variable, Discrete):
+                return variable.choices.index(str(value))
+            return float(value)
+
+        values = [number(trial.situation[variable.name]) for trial in trials]
+        tutored = {number(case[variable.name]) for case in task.tutored()}
+        return cls(variable, np.array(values, np.float64), np.array(sorted(tutored), np.float64))
+
+    @property
+    def discrete(self) -> bool:
+        """Whether nothing lies between two of its values."""
+        return isinstance(self.variable, Discrete)
+
+
+@dataclass(frozen=True)
 class Trials:
     """N trials of one policy, and what it was tutored.
 
     Attributes:
-        values: (N,) of each value of the situation by name.
-        tutored: the values that were tutored, in order, by name.
+        axes: the variables of which several values are tutored, by name.
+        situations: what was played in each trial.
         outcomes: how each trial ended.
+        words: what the figure must know of the task.
     """
 
-    values: Mapping[str, Array]
-    tutored: Mapping[str, Array]
+    axes: Mapping[str, Axis]
+    situations: Sequence[Situation]
     outcomes: Sequence[Outcome]
+    words: FigureWords
 
     @classmethod
     def of(cls, trials: Sequence[CountedTrial], task: Task) -> Trials:
@@ -101,63 +116,63 @@ class Trials:
             )
         for trial in trials:
             task.check(trial.situation)
-        grid = task.tutored()
-        tutored = {name: np.unique([case[name] for case in grid]) for name in grid[0]}
+        axes = {each.name: Axis.of(each, trials, task) for each in task.variables}
         return cls(
-            values={
-                name: np.array([trial.situation[name] for trial in trials])
-                for name, values in tutored.items()
-                if len(values) > 1
-            },
-            tutored={name: values for name, values in tutored.items() if len(values) > 1},
+            axes={name: axis for name, axis in axes.items() if len(axis.tutored) > 1},
+            situations=[trial.situation for trial in trials],
             outcomes=[trial.outcome for trial in trials],
+            words=task.figure_words,
         )
 
-    def measured(self, name: str) -> Array:
-        """(N,) of a number or a reading of the outcomes."""
-        return np.array([getattr(outcome, name) for outcome in self.outcomes], dtype=np.float64)
+    def succeeded(self, reading: str) -> NDArray[np.bool_]:
+        """(N,) whether each trial succeeded in a reading."""
+        return np.array([getattr(outcome, reading) for outcome in self.outcomes], dtype=np.bool_)
+
+    def ended_with(self, reason: str) -> NDArray[np.bool_]:
+        """(N,) whether a reason is that of each trial."""
+        return np.array([outcome.reason == reason for outcome in self.outcomes], dtype=np.bool_)
 
     def betweenness(self, name: str) -> Array:
         """(N,) how far each value is from a tutored one: 0 at it, 1 midway between two."""
-        tutored, values = self.tutored[name], self.values[name]
+        axis = self.axes[name]
+        tutored, values = axis.tutored, axis.values
         upper = np.clip(np.searchsorted(tutored, values), 1, len(tutored) - 1)
         below, above = tutored[upper - 1], tutored[upper]
         return 2 * np.minimum(np.abs(values - below), np.abs(above - values)) / (above - below)
 
     def to_nearest(self, name: str) -> Array:
         """(N,) from each value to the nearest tutored one."""
-        tutored, values = self.tutored[name], self.values[name]
-        nearest = tutored[np.abs(values[:, None] - tutored).argmin(axis=1)]
-        result: Array = nearest - values
+        axis = self.axes[name]
+        nearest = axis.tutored[np.abs(axis.values[:, None] - axis.tutored).argmin(axis=1)]
+        result: Array = nearest - axis.values
         return result
 
     def rate(self, reading: str, chosen: NDArray[np.bool_]) -> Rate:
         """Success in one reading, over the chosen of the trials."""
-        return Rate(int(self.measured(reading)[chosen].sum()), int(chosen.sum()))
+        return Rate(int(self.succeeded(reading)[chosen].sum()), int(chosen.sum()))
 
     def approached(self) -> NDArray[np.bool_]:
         """(N,) whether the hand closed while the object was still in its place."""
-        return (
-            (self.measured("closed_at") >= 0)
-            & (self.measured("moved_mm") <= experiment1.MOVED_MM)
-            & (self.measured("turned_deg") <= experiment1.TURNED_DEG)
+        in_place = (
+            bool(outcome.measures) and self.words.in_place(outcome) for outcome in self.outcomes
         )
+        return np.array(list(in_place), dtype=np.bool_)
 
     def reached(self) -> NDArray[np.bool_]:
         """(N,) whether in addition the hand was about where the object was."""
         reached = self.approached()
-        for name, (_, allowed) in ERRORS.items():
-            reached &= np.abs(self.error(name)) < SHOWN * allowed
+        for error in self.words.errors:
+            reached &= np.abs(self.error(error)) < SHOWN * error.allowed
         return reached
 
-    def error(self, name: str) -> Array:
-        """(N,) one of ERRORS."""
-        if name != "position_mm":
-            return self.measured(name)
-        turn = np.deg2rad(self.values[YAW])
-        along, across = self.measured("along_mm"), self.measured("across_mm")
-        offset: Array = along * np.cos(turn) - across * np.sin(turn)
-        return offset
+    def error(self, error: GraspError) -> Array:
+        """(N,) an error at the grasp; NaN where nothing was measured."""
+        pairs = zip(self.outcomes, self.situations, strict=True)
+        errors = [
+            error.measure(outcome, situation) if outcome.measures else np.nan
+            for outcome, situation in pairs
+        ]
+        return np.array(errors, dtype=np.float64)
 
 
 @dataclass(frozen=True)
@@ -176,17 +191,17 @@ class Snapping:
 
 
 def snapping(trials: Trials, name: str) -> Snapping | None:
-    """Snapping to tutored values of SAW_TEETH; None for others, or with too few trials.
+    """Snapping to tutored values of a variable; None if no error shows it, or with too few trials.
 
     Least squares of the error on the distance to the nearest tutored value; a constant error and
     one that grows with the value, such as a pull to the middle of the range, are told apart.
     """
-    if name not in SAW_TEETH:
+    shown_by = next((each for each in trials.words.errors if each.variable == name), None)
+    if shown_by is None:
         return None
-    error_name, unit = SAW_TEETH[name]
-    error = trials.error(error_name) / unit
+    error = trials.error(shown_by) / shown_by.per_unit
     chosen = trials.reached()
-    columns = (np.ones(len(error)), trials.values[name], trials.to_nearest(name))
+    columns = (np.ones(len(error)), trials.axes[name].values, trials.to_nearest(name))
     causes = np.stack(columns, axis=1)[chosen]
     count, unknowns = causes.shape
     if count < 2 * unknowns or np.linalg.matrix_rank(causes) < unknowns:
@@ -199,7 +214,7 @@ def snapping(trials: Trials, name: str) -> Snapping | None:
 
 def numbers(trials: Trials) -> dict[str, Any]:
     """What the figure shows, for `json.dumps`."""
-    found = {name: snapping(trials, name) for name in trials.values}
+    found = {name: snapping(trials, name) for name in trials.axes}
     return {
         "trials": len(trials.outcomes),
         "near_and_between": {
@@ -207,18 +222,21 @@ def numbers(trials: Trials) -> dict[str, Any]:
                 place: {reading: _rate_json(trials.rate(reading, chosen)) for reading in READINGS}
                 for place, chosen in _places(trials, name).items()
             }
-            for name in trials.values
+            for name, axis in trials.axes.items()
+            if not axis.discrete
         },
         "by_value": {
             name: [
                 {
-                    "from": low,
-                    "to": high,
-                    **{reading: _rate_json(trials.rate(reading, chosen)) for reading in READINGS},
+                    **each.limits(axis),
+                    **{
+                        reading: _rate_json(trials.rate(reading, each.chosen))
+                        for reading in READINGS
+                    },
                 }
-                for low, high, chosen in _bins(trials, name)
+                for each in _bins(axis)
             ]
-            for name in trials.values
+            for name, axis in trials.axes.items()
         },
         "snapping": {name: vars(each) for name, each in found.items() if each is not None},
     }
@@ -233,10 +251,13 @@ def table(trials: Trials) -> Table:
     headings = (f"{reading} {place} %" for reading in READINGS for place in ("near", "between"))
     for heading in ("value", *headings, "snapping"):
         result.add_column(heading, justify="left" if heading == "value" else "right")
-    for name in trials.values:
+    for name, axis in trials.axes.items():
+        if axis.discrete:
+            _add_choices(result, trials, axis)
+            continue
         places = _places(trials, name)
         cells = [
-            _percent(trials.rate(reading, chosen))
+            rate_text(trials.rate(reading, chosen), digits=0)
             for reading in READINGS
             for chosen in places.values()
         ]
@@ -246,61 +267,88 @@ def table(trials: Trials) -> Table:
     return result
 
 
+def _add_choices(result: Table, trials: Trials, axis: Axis) -> None:
+    """Success for each choice of a discrete variable; nothing lies between them."""
+    for each in _bins(axis):
+        strict, precise = (
+            rate_text(trials.rate(reading, each.chosen), digits=0) for reading in READINGS
+        )
+        result.add_row(f"{words_and_unit(axis.variable.name)[0]} {each.name}", strict, "", precise)
+
+
 def draw(trials: Trials, title: str) -> Figure:
     """Where trials failed, how often by each value, and the errors at the grasp."""
     with look():
-        names = list(trials.values)
+        axes_shown, errors = list(trials.axes.values()), trials.words.errors
         figure = Figure(figsize=(9.0, 12.0), layout="constrained")
         figure.suptitle(title, fontsize=10)
         rows: Any = figure.subfigures(2, 1, height_ratios=[1.15, 4.6])
         _draw_maps(rows[0], trials)
         axes = rows[1].subplots(
-            1 + len(ERRORS), len(names), sharex="col", sharey="row", squeeze=False
+            1 + len(errors), len(axes_shown), sharex="col", sharey="row", squeeze=False
         )
-        for column, name in zip(axes.T, names, strict=True):
-            _draw_rates(column[0], trials, name)
-            for each, error in zip(column[1:], ERRORS, strict=True):
-                _draw_errors(each, trials, name, error)
-            column[-1].set_xlabel(label(name))
+        for column, axis in zip(axes.T, axes_shown, strict=True):
+            _draw_rates(column[0], trials, axis)
+            for each, error in zip(column[1:], errors, strict=True):
+                _draw_errors(each, trials, axis, error)
+            _name_values(column[-1].xaxis, column[-1].set_xlabel, axis)
         axes[0, 0].set_ylabel("success (%)")
-        for row, (title_of_error, _) in zip(axes[1:], ERRORS.values(), strict=True):
-            row[0].set_ylabel(title_of_error)
+        for row, error in zip(axes[1:], errors, strict=True):
+            row[0].set_ylabel(error.label)
         axes[0, 0].legend(loc="lower left", ncols=2)
         rows[1].supxlabel(_EXPLANATION, fontsize=8)
         rows[1].align_ylabels(axes[:, 0])
         return figure
 
 
+def _marks(trials: Trials) -> Iterator[tuple[str, str, str, str]]:
+    """Each reason that trials can end with: reason, words, colour, marker."""
+    known = dict(trials.words.reasons)
+    for outcome in trials.outcomes:
+        known.setdefault(outcome.reason, outcome.reason.replace("_", " "))
+    for (reason, words), (colour, marker) in zip(known.items(), cycle(_MARKS), strict=False):
+        yield reason, words, colour, marker
+
+
 def _draw_maps(figure: Any, trials: Trials) -> None:
-    pairs = list(combinations(trials.values, 2)) or [(next(iter(trials.values)),) * 2]
+    shown = list(trials.axes.values())
+    pairs = list(combinations(shown, 2)) or [(shown[0],) * 2]
     axes = figure.subplots(1, len(pairs), squeeze=False)[0]
     for each, (across, up) in zip(axes, pairs, strict=True):
-        for reason, (words, colour, marker) in REASONS.items():
-            chosen = np.array([outcome.reason is reason for outcome in trials.outcomes])
+        for reason, words, colour, marker in _marks(trials):
+            chosen = trials.ended_with(reason)
+            fine = reason == NO_FAILURE
             each.scatter(
-                trials.values[across][chosen],
-                trials.values[up][chosen],
-                s=7 if reason is Reason.NONE else 14,
+                across.values[chosen],
+                up.values[chosen],
+                s=7 if fine else 14,
                 color=colour,
                 marker=marker,
                 linewidths=0.8 if marker == "x" else 0,
-                alpha=0.35 if reason is Reason.NONE else 0.9,
+                alpha=0.35 if fine else 0.9,
                 label=f"{words} ({chosen.sum()})" if chosen.any() else None,
             )
-        each.set_xlabel(label(across))
-        each.set_ylabel(label(up))
-        _mark_tutored(each.axvline, trials.tutored[across])
-        _mark_tutored(each.axhline, trials.tutored[up])
+        _name_values(each.xaxis, each.set_xlabel, across)
+        _name_values(each.yaxis, each.set_ylabel, up)
+        _mark_tutored(each.axvline, across.tutored)
+        _mark_tutored(each.axhline, up.tutored)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), columnspacing=1.2)
 
 
-def _draw_rates(axes: Axes, trials: Trials, name: str) -> None:
-    bins = _bins(trials, name)
-    centres = np.array([(low + high) / 2 for low, high, _ in bins])
-    nudge = 0.02 * float(np.diff(trials.tutored[name]).min())
+def _name_values(side: Any, set_label: Callable[[str], object], axis: Axis) -> None:
+    """Label a side of a panel; choices stand there by name."""
+    set_label(label(axis.variable.name))
+    if isinstance(axis.variable, Discrete):
+        side.set_ticks(range(len(axis.variable.choices)), axis.variable.choices)
+
+
+def _draw_rates(axes: Axes, trials: Trials, axis: Axis) -> None:
+    bins = _bins(axis)
+    centres = np.array([(each.low + each.high) / 2 for each in bins])
+    nudge = 0.02 * float(np.diff(axis.tutored).min())
     for side, reading in enumerate(READINGS):
-        middle, reach = percent(trials.rate(reading, chosen) for _, _, chosen in bins)
+        middle, reach = percent(trials.rate(reading, each.chosen) for each in bins)
         axes.errorbar(
             centres + (2 * side - 1) * nudge,
             middle,
@@ -308,31 +356,30 @@ def _draw_rates(axes: Axes, trials: Trials, name: str) -> None:
             color=READING_COLOURS[reading],
             marker="o",
             markersize=3,
-            linewidth=1.0,
+            linewidth=0.0 if axis.discrete else 1.0,
             elinewidth=0.8,
             label=reading,
         )
     axes.set_ylim(0, 102)
-    _mark_tutored(axes.axvline, trials.tutored[name])
+    _mark_tutored(axes.axvline, axis.tutored)
 
 
-def _draw_errors(axes: Axes, trials: Trials, name: str, error: str) -> None:
-    _, allowed = ERRORS[error]
+def _draw_errors(axes: Axes, trials: Trials, axis: Axis, error: GraspError) -> None:
+    allowed = error.allowed
     limit = SHOWN * allowed
-    chosen, values = trials.approached(), trials.values[name]
+    chosen, values = trials.approached(), axis.values
     errors = np.clip(trials.error(error), -0.97 * limit, 0.97 * limit)  # none is left out
     axes.axhspan(-allowed, allowed, color=GREY, alpha=0.15, linewidth=0)
     axes.axhline(0, color=GREY, linewidth=0.5)
-    for reason, (_, colour, _) in REASONS.items():
-        those = chosen & np.array([outcome.reason is reason for outcome in trials.outcomes])
+    for reason, _, colour, _ in _marks(trials):
+        those = chosen & trials.ended_with(reason)
         axes.scatter(values[those], errors[those], s=4, color=colour, alpha=0.5, linewidths=0)
-    tooth, unit = SAW_TEETH.get(name, ("", 1.0))
-    if error == tooth:
-        taught, snapped = _saw_tooth(trials.tutored[name])
-        axes.plot(taught, unit * snapped, color=BLACK, linewidth=0.7)
+    if error.variable == axis.variable.name:
+        taught, snapped = _saw_tooth(axis.tutored)
+        axes.plot(taught, error.per_unit * snapped, color=BLACK, linewidth=0.7)
     axes.set_ylim(-limit, limit)
     axes.set_yticks([-2 * allowed, -allowed, 0, allowed, 2 * allowed])
-    _mark_tutored(axes.axvline, trials.tutored[name])
+    _mark_tutored(axes.axvline, axis.tutored)
 
 
 def _saw_tooth(tutored: Array) -> tuple[Array, Array]:
@@ -350,16 +397,42 @@ def _mark_tutored(line: Any, tutored: Iterable[float]) -> None:
         line(value, color=GREY, linewidth=0.5, linestyle=(0, (2, 2)), zorder=0)
 
 
-def _bins(trials: Trials, name: str) -> list[tuple[float, float, NDArray[np.bool_]]]:
-    """Ranges of a value in order, around tutored values and between them by turns."""
-    tutored, values = trials.tutored[name], trials.values[name]
+@dataclass(frozen=True)
+class _Bin:
+    """A range of a variable's values.
+
+    Attributes:
+        name: the choice, of a discrete variable; else empty.
+        low: its lower end.
+        high: its upper end.
+        chosen: (N,) which trials lie in it.
+    """
+
+    name: str
+    low: float
+    high: float
+    chosen: NDArray[np.bool_]
+
+    def limits(self, axis: Axis) -> dict[str, Any]:
+        """What it is, for `json.dumps`."""
+        return {"choice": self.name} if axis.discrete else {"from": self.low, "to": self.high}
+
+
+def _bins(axis: Axis) -> list[_Bin]:
+    """Ranges of the values in order: around tutored values and between them in turn, or choices."""
+    if isinstance(axis.variable, Discrete):
+        return [
+            _Bin(choice, number, number, axis.values == number)
+            for number, choice in enumerate(axis.variable.choices)
+        ]
+    tutored = axis.tutored
     edges = [tutored[0]]
     for below, above in pairwise(tutored):
         edges += [below + (above - below) / 4, below + 3 * (above - below) / 4]
     edges.append(tutored[-1])
-    number = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+    number = np.clip(np.searchsorted(edges, axis.values, side="right") - 1, 0, len(edges) - 2)
     return [
-        (float(low), float(high), number == which)
+        _Bin("", float(low), float(high), number == which)
         for which, (low, high) in enumerate(pairwise(edges))
     ]
 
@@ -371,8 +444,3 @@ def _places(trials: Trials, name: str) -> dict[str, NDArray[np.bool_]]:
 
 def _rate_json(rate: Rate) -> dict[str, Any]:
     return rate.as_json() | {"trials": rate.trials}
-
-
-def _percent(rate: Rate) -> str:
-    low, high = rate.wilson95
-    return f"{100 * rate.rate:.0f} ({100 * low:.0f} to {100 * high:.0f})"

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from services.figures.style import BLACK, BLUE, GREY, look, percent
+from services.terminal.rates import difference_text, percent_text, rate_text
 from services.trials.success import READINGS, Rate, Tally, difference95, pooled
-from services.trials.sweeps import Tested
+from services.trials.sweeps import RunOutcomes
 
 PAPER: Final[Mapping[float, Rate]] = {30.0: Rate(32, 52), 150.0: Rate(44, 52)}
 """What the paper published; it counts what is lifted at the end, our `lenient`."""
@@ -23,11 +24,11 @@ Tallies = Mapping[float, Mapping[int, Tally]]
 """What was counted by time constant and training seed."""
 
 
-def tallies_of(tested: Sequence[Tested]) -> Tallies:
+def tallies_of(tested: Sequence[RunOutcomes]) -> Tallies:
     """Count the outcomes; both keys are in order."""
     by_tau: dict[float, dict[int, Tally]] = defaultdict(dict)
-    for each in sorted(tested, key=lambda each: (_tau(each), each.member.seed)):
-        by_tau[_tau(each)][each.member.seed] = Tally.of(each.outcomes)
+    for each in sorted(tested, key=lambda each: (_tau(each), each.run.seed)):
+        by_tau[_tau(each)][each.run.seed] = Tally.of(each.outcomes)
     return by_tau
 
 
@@ -67,12 +68,13 @@ def table(tallies: Tallies) -> Table:
     for tau, by_seed in tallies.items():
         for reading in READINGS:
             rate = pooled(by_seed.values(), reading)
-            low, high = rate.wilson95
-            seeds = ", ".join(f"{100 * tally.rate(reading).rate:.0f}" for tally in by_seed.values())
+            seeds = ", ".join(
+                percent_text(tally.rate(reading).rate, 0) for tally in by_seed.values()
+            )
             result.add_row(
                 f"{tau:g}" if reading == READINGS[0] else "",
                 reading,
-                f"{100 * rate.rate:.1f} ({100 * low:.1f} to {100 * high:.1f})",
+                rate_text(rate),
                 seeds,
                 _against_text(tallies, tau, reading),
             )
@@ -137,9 +139,8 @@ def _against_text(tallies: Tallies, tau: float, reading: str) -> str:
     if PAPERS_TAU not in tallies or tau == PAPERS_TAU:
         return ""
     found = _against(tallies, tau, reading)
-    low, high = found["interval95"]
-    return f"{100 * found['difference']:+.1f} ({100 * low:+.1f} to {100 * high:+.1f})"
+    return difference_text(found["difference"], found["interval95"])
 
 
-def _tau(tested: Tested) -> float:
-    return tested.member.config.network.pfc.tau
+def _tau(tested: RunOutcomes) -> float:
+    return tested.run.config.network.pfc.tau

@@ -10,7 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from actors.tasks.contract import Situation, Task
+from actors.tasks.contract import Task
 from learner.tutoring.store import TutoringStore
 from proto.config import Config, load_config
 from proto.episode import Episode, Kind
@@ -18,6 +18,7 @@ from proto.errors import UserError
 from proto.messages import TutoringCase
 from proto.recordings.episodes import read_episode
 from proto.storage import parts_in
+from proto.variables import Situation
 from services.playing.workers import Job, play_all
 
 

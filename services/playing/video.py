@@ -18,9 +18,10 @@ from actors.simulator import EYE_HEIGHT, EYE_WIDTH, Crop, Pose, Simulator, make_
 from actors.tasks.registry import make_task
 from proto.body import FOCUS
 from proto.config import SimulatorConfig, TaskConfig
-from proto.episode import Episode, Outcome, Reason
+from proto.episode import NO_FAILURE, Episode, Outcome
 from proto.errors import UserError
 from proto.storage import written_whole
+from proto.variables import situation_text
 
 Picture = NDArray[np.uint8]
 
@@ -74,7 +75,7 @@ def frames(episode: Episode, simulator: Simulator) -> Iterator[Picture]:
     for step in range(episode.steps):
         poses = _poses(episode, step)
         joints_deg = episode.joints_deg[step].astype(np.float64)
-        simulator.show(joints_deg, {name: poses[name] for name in boxes & poses.keys()})
+        simulator.show(joints_deg, {name: poses[name] for name in boxes & poses.keys()}, step)
         outside = simulator.outside_picture(PANEL_WIDTH, PANEL_HEIGHT).copy()
         _write_lines(outside, _caption(episode, step))
         focus = _focus_before(episode, step, float(task.start[FOCUS]))
@@ -121,8 +122,8 @@ def _caption(episode: Episode, step: int) -> list[str]:
         policy += f" version {episode.policy_version}"
     return [
         f"{episode.task} in {episode.backend}, {episode.kind} by {policy}",
-        ", ".join(f"{name} {value:.4g}" for name, value in episode.situation.items()),
-        f"step {step + 1} of {episode.steps}, phase {episode.phases[step]}, "
+        situation_text(episode.situation),
+        f"step {step + 1} of {episode.steps}, {episode.phase_names[episode.phases[step]]}, "
         f"outcome: {_in_words(episode.outcome)}",
     ]
 
@@ -130,8 +131,8 @@ def _caption(episode: Episode, step: int) -> list[str]:
 def _in_words(outcome: Outcome) -> str:
     reached = [name for name in ("lenient", "strict", "precise") if getattr(outcome, name)]
     words = reached[-1] if reached else "failed"
-    if outcome.reason is not Reason.NONE:
-        words += f" ({outcome.reason.value.replace('_', ' ')})"
+    if outcome.reason != NO_FAILURE:
+        words += f" ({outcome.reason.replace('_', ' ')})"
     return words
 
 

@@ -19,15 +19,16 @@ from itertools import islice
 from pathlib import Path
 
 from actors.player import play
-from actors.policies.by_name import make_policy, make_tutor
+from actors.policies.by_name import make_policy
 from actors.policies.contract import Policy, StatefulPolicy
+from actors.policies.planned import make_tutor
 from actors.simulator import Simulator, make_simulator
-from actors.tasks.contract import Situation
 from actors.tasks.registry import make_task
 from proto.config import Config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.recordings.episodes import write_episode
+from proto.variables import Situation
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,9 @@ class _Player:
     def _policy_for(self, job: Job) -> Policy:
         if job.noisy not in self._policies:
             self._policies[job.noisy] = (
-                make_tutor(self._config, noisy=True)
+                make_tutor(self._task, self._config.tutor)
                 if job.noisy
-                else make_policy(self._policy, self._config)
+                else make_policy(self._policy, self._task)
             )
         return self._policies[job.noisy]
 
@@ -143,8 +144,7 @@ def _with_states(policy: Policy) -> StatefulPolicy:
 
 
 def _pool(workers: int, config: Config, policy: str) -> ProcessPoolExecutor:
-    for threads in ("OMP_NUM_THREADS", "LP_NUM_THREADS"):  # torch, and Mesa's software Vulkan
-        os.environ.setdefault(threads, "1")
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch starts so many threads in each worker
     return ProcessPoolExecutor(
         workers,
         mp_context=multiprocessing.get_context("spawn"),

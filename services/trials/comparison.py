@@ -1,4 +1,4 @@
-"""VMDNN beside variants of itself and networks of other kinds, on the same sequences."""
+"""Comparison of VMDNN with variants of itself and with networks of other kinds (rivals)."""
 
 from __future__ import annotations
 
@@ -9,21 +9,23 @@ from typing import Any, Final
 
 from rich.table import Table
 
-from learner.network.subnets import subnets
-from learner.rivals.networks import make_rival, rival_config, weights_of
+from actors.tasks.registry import make_pretraining_task
+from learner.rivals.networks import weights_of
+from learner.rivals.rival_recipe import make_recipe
 from learner.tutoring.store import TutoringStore
 from proto.config import Config
 from proto.episode import Episode
 from proto.errors import UserError
 from services.playing.tutoring import check_recorded, record, tutoring_jobs_again
+from services.terminal.rates import percent_text, rate_text
 from services.trials.success import READINGS, Tally, difference95, pooled
-from services.trials.sweeps import Tested, Variant, training_s
+from services.trials.sweeps import RunOutcomes, Variant, training_s
 
 VMDNN: Final = "vmdnn"
 FIXED_GAZE: Final = "fixed-gaze"
 
 ONE_TAU: Final = 10.0
-"""The middle of VMDNN's time constants: the geometric mean of 2, 30, 150, 10 and 2 is 11.3."""
+"""About the geometric mean of VMDNN's time constants 2, 30, 150, 10 and 2, which is 11.3."""
 
 
 def _one_time_constant(name: str, config: Config) -> Variant:
@@ -38,7 +40,7 @@ CONTENDERS: Final[Mapping[str, Callable[[str, Config], Variant]]] = {
     "cnn-lstm": lambda name, config: Variant(name, config, rival="cnn-lstm"),
     "feed-forward": lambda name, config: Variant(name, config, rival="feed-forward"),
 }
-"""What is compared: VMDNN, then what it does without, then what else could be in its place."""
+"""What is compared: VMDNN, then VMDNN without one of its parts, then other networks."""
 
 
 def variants(config: Config, names: Sequence[str]) -> list[Variant]:
@@ -48,28 +50,27 @@ def variants(config: Config, names: Sequence[str]) -> list[Variant]:
 
 def weights(variant: Variant) -> int:
     """Number of weights and biases of a contender."""
-    config = variant.config
-    if variant.rival is None:
-        parts = subnets(config.network).values()
-        return sum(part.weights + part.biases for part in parts)
-    units = rival_config(config.comparison, variant.rival).units
-    return weights_of(make_rival(variant.rival, units, config.network))
+    questions = make_pretraining_task(variant.config).questions
+    return weights_of(make_recipe(variant.config, variant.rival, questions).network)
 
 
 def tutored_again(
     store: TutoringStore, variant: Variant, active: Config, folder: Path, *, workers: int
 ) -> Generator[Episode, None, None]:
-    """Tutor a variant in what a store shows, its cases and its noise, and yield all episodes.
+    """Repeat the tutoring in a store, its cases and noise, with a variant's config.
 
     Args:
-        store: sequences that were tutored as the config `active` says, but for the task.
-        variant: who is to learn from it.
+        store: sequences that were tutored with the config `active`; their task may be another.
+        variant: the variant that will learn from the repetition.
         active: the config of VMDNN.
-        folder: where the episodes are recorded; what it holds is not played again.
+        folder: where episodes are recorded; those already there are not played again.
         workers: processes to play in.
 
+    Yields:
+        All episodes.
+
     Raises:
-        UserError: a sequence was shown otherwise, or not by the tutor alone.
+        UserError: a sequence was tutored with another config, or it is a correction.
     """
     task = {"task.name": _task_of(store)}
     check_recorded(store.folder, Variant.of("data", active, task).config)
@@ -87,12 +88,12 @@ def _task_of(store: TutoringStore) -> str:
 
 
 @dataclass(frozen=True)
-class Standing:
-    """How one contender did.
+class Score:
+    """Results of one contender.
 
     Attributes:
         variant: the contender.
-        by_seed: what was counted by training seed.
+        by_seed: counted trials by training seed.
         training_s: processor time of a training, mean over the seeds (s).
     """
 
@@ -101,23 +102,23 @@ class Standing:
     training_s: float
 
 
-def standings(tested: Sequence[Tested]) -> list[Standing]:
-    """How each contender did, in the order of `tested`."""
-    by_name: dict[str, list[Tested]] = {}
+def scores(tested: Sequence[RunOutcomes]) -> list[Score]:
+    """Results of each contender, in the order of `tested`."""
+    by_name: dict[str, list[RunOutcomes]] = {}
     for each in tested:
-        by_name.setdefault(each.member.variant.name, []).append(each)
+        by_name.setdefault(each.run.variant.name, []).append(each)
     return [
-        Standing(
-            variant=group[0].member.variant,
-            by_seed={each.member.seed: Tally.of(each.outcomes) for each in group},
-            training_s=sum(training_s(each.member) for each in group) / len(group),
+        Score(
+            variant=group[0].run.variant,
+            by_seed={each.run.seed: Tally.of(each.outcomes) for each in group},
+            training_s=sum(training_s(each.run) for each in group) / len(group),
         )
         for group in by_name.values()
     ]
 
 
-def numbers(found: Sequence[Standing]) -> dict[str, Any]:
-    """All that was found, for `json.dumps`."""
+def numbers(found: Sequence[Score]) -> dict[str, Any]:
+    """All results, for `json.dumps`."""
     return {
         "contenders": [
             {
@@ -137,12 +138,12 @@ def numbers(found: Sequence[Standing]) -> dict[str, Any]:
     }
 
 
-def table(found: Sequence[Standing]) -> Table:
+def table(found: Sequence[Score]) -> Table:
     """Success by contender and reading."""
     result = Table(
-        caption="% of all seeds' trials with 95 % Wilson intervals, and by seed; the intervals are"
-        " of trials: how far networks differ, the seeds tell; weights count biases; minutes are the"
-        " processor's, for the training of one network"
+        caption="% of the trials of all seeds with 95 % Wilson intervals, and by seed; the"
+        " intervals cover the choice of trials, the seeds show how networks differ; weights include"
+        " biases; minutes are processor time of training one network"
     )
     for heading in ("network", "reading", "all seeds", "by seed"):
         result.add_column(heading, no_wrap=heading != "by seed")
@@ -154,20 +155,14 @@ def table(found: Sequence[Standing]) -> Table:
         )
         for line, reading in zip(about, READINGS, strict=True):
             rate = pooled(each.by_seed.values(), reading)
-            low, high = rate.wilson95
-            seeds = (f"{100 * tally.rate(reading).rate:.0f}" for tally in each.by_seed.values())
-            result.add_row(
-                line,
-                reading,
-                f"{100 * rate.rate:.1f} ({100 * low:.1f} to {100 * high:.1f})",
-                ", ".join(seeds),
-            )
+            seeds = (percent_text(tally.rate(reading).rate, 0) for tally in each.by_seed.values())
+            result.add_row(line, reading, rate_text(rate), ", ".join(seeds))
         result.add_section()
     return result
 
 
-def _against_vmdnn(found: Sequence[Standing], each: Standing) -> dict[str, Any]:
-    """How much higher its rates are than VMDNN's, where that was tested too."""
+def _against_vmdnn(found: Sequence[Score], each: Score) -> dict[str, Any]:
+    """By how much its rates exceed VMDNN's; empty for VMDNN, and if VMDNN was not tested."""
     vmdnn = next((other for other in found if other.variant.name == VMDNN), None)
     if vmdnn is None or vmdnn is each:
         return {}

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from actors.tasks.contract import Situation
 from actors.tasks.registry import make_task
 from proto.config import Config
 from proto.episode import Kind
-from proto.errors import UserError
+from proto.variables import Situation
 from services.playing.workers import Job
 from services.trials.success import Tally
 
@@ -41,19 +40,6 @@ def situation_jobs(
         )
         for trial, situation in enumerate(situations)
     ]
-
-
-def parse_situation(text: str) -> dict[str, float]:
-    """Read a situation such as `obstacle_x_m=-0.27,object_y_m=0.25,object_yaw_deg=44`.
-
-    Raises:
-        UserError: it is written otherwise.
-    """
-    try:
-        pairs = [part.split("=") for part in text.split(",")]
-        return {name.strip(): float(value) for name, value in pairs}
-    except ValueError:
-        raise UserError(f"--situation {text}: write NAME=VALUE,NAME=VALUE,...") from None
 
 
 def result_json(config: Config, policy: str, tally: Tally, wall_s: float) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from proto.episode import Outcome, Reason
+from proto.episode import NO_FAILURE, Outcome
 
 READINGS: Final = ("lenient", "strict", "precise")
 """From the least to the most demanding; see `proto.episode.Outcome`."""
@@ -91,8 +91,8 @@ class Tally:
         """Count one more."""
         self.trials += 1
         self.successes.update(reading for reading in READINGS if getattr(outcome, reading))
-        if outcome.reason is not Reason.NONE:
-            self.reasons[outcome.reason.value] += 1
+        if outcome.reason != NO_FAILURE:
+            self.reasons[outcome.reason] += 1
 
     def rate(self, reading: str) -> Rate:
         """The rate in one of READINGS."""

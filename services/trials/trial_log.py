@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections import defaultdict
 from collections.abc import Mapping
@@ -9,35 +10,33 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
-from proto.codec import MessageError, Number, Table, Wire, decode, encode, message, schema_of
-from proto.episode import Episode, Id, Outcome, Reason
+from proto.codec import (
+    Integer,
+    MessageError,
+    Wire,
+    decode,
+    encode,
+    message,
+    record_of,
+    schema_of,
+)
+from proto.episode import SIMULATION_FAILED, Episode, Id, Outcome
 from proto.errors import UserError
 from proto.messages import Count, EpisodeFailed, Rollout
+from proto.recordings import format1
 from proto.storage import append_line, drop_unfinished_line
+from proto.variables import SituationField
 
 LOG = logging.getLogger(__name__)
 
-SIMULATION_FAILED: Final = Outcome(
-    lenient=False,
-    strict=False,
-    precise=False,
-    reason=Reason.SIMULATION_FAILED,
-    lifted_m=0.0,
-    moved_mm=0.0,
-    turned_deg=0.0,
-    yaw_error_deg=0.0,
-    along_mm=0.0,
-    across_mm=0.0,
-    closed_at=-1,
-    obstacle_touched_at=-1,
-)
-"""Outcome of a trial without a valid episode; its measures say nothing."""
+FORMAT: Final = 2
+"""Format of the lines that are written; those of format 1 can be read, too."""
 
 
-@message("counted_trial", 1, form="json")
+@message("counted_trial", 2, form="json")
 @dataclass(frozen=True)
 class CountedTrial:
-    """One line of the book.
+    """One line of the log.
 
     Attributes:
         run_id: training that the policy comes from.
@@ -45,8 +44,9 @@ class CountedTrial:
         seed: seed of the situation; it tells one trial of a version from another.
         episode: id of the episode.
         actor: who played it.
-        situation: the situation's values by name.
+        situation: the values of the task's variables by name.
         outcome: how it ended.
+        format: format of the line.
     """
 
     run_id: Id
@@ -54,8 +54,9 @@ class CountedTrial:
     seed: int
     episode: Id
     actor: Id
-    situation: Annotated[Mapping[str, float], Table(Number(), most=32)]
+    situation: SituationField
     outcome: Outcome
+    format: Annotated[int, Integer(FORMAT, FORMAT)] = FORMAT
 
     @classmethod
     def of(cls, episode: Episode, run_id: str) -> CountedTrial:
@@ -94,7 +95,29 @@ def read_trials(path: Path) -> list[CountedTrial]:
 
 
 def _trial(line: bytes) -> CountedTrial:
-    return decode(Wire(schema_of(CountedTrial).encoding, line), CountedTrial)
+    """The trial of a line, which may be of format 1.
+
+    Raises:
+        MessageError: it is no such line, or one of a newer format.
+    """
+    encoding = schema_of(CountedTrial).encoding
+    try:
+        values = json.loads(line)
+        number = values.setdefault("format", 1)
+        if number == 1:
+            outcome = format1.outcome_of(values["outcome"])
+            values["outcome"] = record_of(Outcome).pack(outcome)
+            values["format"] = FORMAT
+            line = json.dumps(values).encode()
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise MessageError("payload", f"is no counted trial: {error!r:.128}") from error
+    if isinstance(number, int) and number > FORMAT:
+        raise MessageError(
+            "format",
+            f"{number} was written by a newer vmdnn; this one reads formats up to {FORMAT}:"
+            " update vmdnn to read it",
+        )
+    return decode(Wire(encoding, line), CountedTrial)
 
 
 class TrialLog:

@@ -20,6 +20,7 @@ from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 from actors.tasks.experiment1.plan import plan
 from actors.tasks.registry import make_task
 from learner.training.trainer import Trainer
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.store import TutoringStore
 from proto.bus import Bus, open_bus
 from proto.config import Config, HubConfig, LearnerConfig, PretrainingConfig, TaskConfig
@@ -57,7 +58,7 @@ def policy(
     store = TutoringStore(tmp_path_factory.mktemp("tutoring"))
     store.add(make_episode(20, kind=Kind.TUTORING, situation=dict(TASK.tutored()[0])))
     config = Config(learner=LearnerConfig(pretraining=PretrainingConfig(epochs=0)))
-    trainer = Trainer(config, store)
+    trainer = Trainer(VMDNNRecipe(config, TASK.questions), store)
     trainer.epoch()
 
     def make(version: int, run_id: str = "training") -> PolicyVersion:

@@ -11,7 +11,7 @@ from services.cli import main
 
 
 def test_prints_what_was_measured(monkeypatch, capsys):
-    monkeypatch.setattr(bench, "ROUNDS", 1)
+    monkeypatch.setattr(bench, "REPETITIONS", 1)
     assert main(["bench", "actor", "--json"]) == 0
     speed = json.loads(capsys.readouterr().out)
     assert list(speed) == [

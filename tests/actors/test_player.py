@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 
 from actors.player import play
-from actors.policies.by_name import make_policy, make_tutor
+from actors.policies.by_name import make_policy
+from actors.policies.planned import make_tutor
 from actors.simulator import make_simulator
-from actors.tasks.experiment1.reaching import Reaching
-from actors.tasks.experiment1.task import Experiment1
+from actors.tasks.registry import make_task
 from proto.body import ARM, FOCUS, GRASP, NECK
-from proto.config import Config, SimulatorConfig
-from proto.episode import Kind, Reason
+from proto.config import SimulatorConfig, TaskConfig, TutorConfig
+from proto.episode import Kind
 from proto.errors import UserError
 
-TASK = Experiment1()
+TASK = make_task(TaskConfig())
+REACHING = make_task(TaskConfig(name="reaching"))
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def physics():
 
 def outcome(simulator, policy, situation, seed=0):
     return play(
-        simulator, TASK, make_policy(policy, Config()), situation, seed=seed, kind=Kind.TRIAL
+        simulator, TASK, make_policy(policy, TASK), situation, seed=seed, kind=Kind.TRIAL
     ).outcome
 
 
@@ -52,7 +53,7 @@ def test_without_eyes_for_yaw_a_turned_object_is_shoved(physics):
 @pytest.mark.parametrize("obstacle_x_m", [-0.32, -0.22])
 def test_without_eyes_for_the_obstacle_it_is_touched(physics, obstacle_x_m):
     situation = {"obstacle_x_m": obstacle_x_m, "object_y_m": 0.25, "object_yaw_deg": 0.0}
-    assert outcome(physics, "obstacle-blind", situation).reason is Reason.TOUCHED_OBSTACLE
+    assert outcome(physics, "obstacle-blind", situation).reason == "touched_obstacle"
 
 
 def test_replay_only_works_where_it_was_recorded(physics):
@@ -71,8 +72,8 @@ def test_without_an_obstacle_the_tutor_moves_as_over_the_middle_one(physics, nam
     situation = {"object_y_m": 0.25, "object_yaw_deg": 22.5}
     over = {**situation, "obstacle_x_m": -0.27}
     free, blocked = (
-        play(physics, task, make_policy(name, Config()), where, seed=0, kind=Kind.TUTORING)
-        for task, where in ((Reaching(), situation), (TASK, over))
+        play(physics, task, make_policy(name, task), where, seed=0, kind=Kind.TUTORING)
+        for task, where in ((REACHING, situation), (TASK, over))
     )
     assert free.outcome.precise
     assert free.situation == situation
@@ -80,22 +81,24 @@ def test_without_an_obstacle_the_tutor_moves_as_over_the_middle_one(physics, nam
 
 
 def test_lifting_needs_friction(monkeypatch):
-    class Slippery(Experiment1):
+    class Slippery(type(TASK)):
         def scene(self, situation):
             scene = super().scene(situation)
             boxes = tuple(dataclasses.replace(box, friction=0.02) for box in scene.boxes)
             return dataclasses.replace(scene, boxes=boxes)
 
-    monkeypatch.setattr("actors.backends.sapien.world.ROBOT_FRICTION", 0.02)
+    monkeypatch.setattr("actors.backends.robot.SKIN_FRICTION", 0.02)
     simulator = make_simulator(SimulatorConfig(render=False))
-    policy = make_tutor(Config(), noisy=False)
-    episode = play(simulator, Slippery(), policy, TASK.sample(1), seed=0, kind=Kind.TRIAL)
+    policy = make_tutor(TASK)
+    episode = play(
+        simulator, Slippery(TaskConfig()), policy, TASK.sample(1), seed=0, kind=Kind.TRIAL
+    )
     simulator.close()
     assert not episode.outcome.lenient
 
 
 def test_the_same_episode_can_be_played_again_bit_by_bit(physics):
-    tutor = make_tutor(Config(), noisy=True)
+    tutor = make_tutor(TASK, TutorConfig())
     play_it = lambda seed: play(  # noqa: E731
         physics, TASK, tutor, TASK.tutored()[5], seed=seed, kind=Kind.TUTORING
     )
@@ -109,11 +112,11 @@ def test_the_same_episode_can_be_played_again_bit_by_bit(physics):
 
 def test_noise_is_in_the_actions_and_the_clean_plan_stays_the_target(physics):
     clean = play(
-        physics, TASK, make_tutor(Config(), noisy=False), TASK.tutored()[5],
+        physics, TASK, make_tutor(TASK), TASK.tutored()[5],
         seed=0, kind=Kind.TUTORING,
     )  # fmt: skip
     noisy = play(
-        physics, TASK, make_tutor(Config(), noisy=True), TASK.tutored()[5],
+        physics, TASK, make_tutor(TASK, TutorConfig()), TASK.tutored()[5],
         seed=1, kind=Kind.TUTORING,
     )  # fmt: skip
     np.testing.assert_array_equal(clean.actions, clean.targets)
@@ -123,7 +126,7 @@ def test_noise_is_in_the_actions_and_the_clean_plan_stays_the_target(physics):
 
 def test_an_unknown_policy_lists_the_ones_there_are():
     with pytest.raises(UserError, match=r"tutor, replay, yaw-blind, obstacle-blind, lookup"):
-        make_policy("tutr", Config())
+        make_policy("tutr", TASK)
 
 
 def test_an_unknown_backend_lists_the_ones_there_are():
@@ -133,8 +136,8 @@ def test_an_unknown_backend_lists_the_ones_there_are():
 
 
 def test_with_attention_fixed_the_tutor_neither_turns_its_head_nor_focuses(physics):
-    fixed, case = Experiment1("fixed"), TASK.tutored()[3]
-    noisy = make_tutor(Config(), noisy=True)
+    fixed, case = make_task(TaskConfig(attention="fixed")), TASK.tutored()[3]
+    noisy = make_tutor(TASK, TutorConfig())
     still = play(physics, fixed, noisy, case, seed=3001, kind=Kind.TUTORING)
     moving = play(physics, TASK, noisy, case, seed=3001, kind=Kind.TUTORING)
     held, free = np.r_[NECK, FOCUS], np.r_[ARM, GRASP]

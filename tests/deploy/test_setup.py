@@ -1,10 +1,13 @@
-"""The scripts explain themselves, and say what is missing where they may not install it."""
+"""The scripts explain their arguments, and say what is missing where they may not install it."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,9 +17,9 @@ TOOLS = ("bash", "cat", "dirname", "env")
 
 
 def call(
-    *command: str | Path, path: Path | None = None, cwd: Path | None = None
+    *command: str | Path, path: Path | None = None, cwd: Path | None = None, **more: str
 ) -> subprocess.CompletedProcess[str]:
-    environment = os.environ | ({"PATH": str(path)} if path else {})
+    environment = os.environ | ({"PATH": str(path)} if path else {}) | more
     return subprocess.run(
         command,
         capture_output=True,
@@ -60,11 +63,59 @@ def test_without_python_and_without_a_way_to_install_it_says_what_to_run(
 
 def test_a_machine_that_is_set_up_is_left_alone(tmp_path: Path) -> None:
     stamp = DEPLOY.parent / ".venv" / "installed"
-    if not stamp.exists():
-        pytest.skip("this environment was not made by deploy/setup.sh")
+    installed_from = (DEPLOY / "requirements.lock", DEPLOY.parent / "pyproject.toml")
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in installed_from)).hexdigest()
+    if not stamp.exists() or stamp.read_text().split()[0] != digest:  # else it would install
+        pytest.skip("deploy/setup.sh did not make this environment from this checkout")
     before = stamp.stat().st_mtime_ns
     script = f"set -euo pipefail; source {DEPLOY / 'setup.sh'}; setup; echo ready"
     answer = call("bash", "-c", script, cwd=tmp_path)
     assert (answer.returncode, answer.stdout) == (0, "ready\n"), answer.stderr
     assert answer.stderr == ""
     assert stamp.stat().st_mtime_ns == before
+
+
+def set_up_graphics(bare: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """`setup_graphics` on a machine without a graphics driver and without apt-get."""
+    venv = Path(sys.executable).parents[1]
+    script = f'set -euo pipefail; source {DEPLOY / "setup.sh"}; VENV={venv}; setup_graphics "$@"'
+    return call(
+        *("bash", "-c", script, "setup", *arguments),
+        path=bare / "bin",
+        cwd=bare,
+        PYTHONPATH=str(DEPLOY.parent),
+        VK_DRIVER_FILES="/nonexistent.json",
+    )
+
+
+def test_without_a_driver_it_says_what_is_wrong_and_what_to_install(bare: Path) -> None:
+    answer = set_up_graphics(bare, "--actors", "2")
+    assert answer.returncode == 1
+    assert "no Vulkan driver was found" in answer.stderr
+    assert "no graphics driver that can render" in answer.stderr
+    assert re.search("apt-get install --no-install-recommends .*mesa-vulkan", answer.stderr)
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--set", "simulator.render=false"), ("--backend", "nothing")]
+)
+def test_no_driver_is_asked_for_where_none_would_help(bare: Path, arguments: list[str]) -> None:
+    """Without pictures none is needed, and run_local.py says what is wrong with its arguments."""
+    answer = set_up_graphics(bare, *arguments)
+    assert (answer.returncode, answer.stderr) == (0, "")
+
+
+def test_a_backend_that_names_no_packages_has_its_say(bare: Path) -> None:
+    (bare / "own_backend.py").write_text(
+        "from actors.backends.sapien.simulator import SapienSimulator\n"
+        "from actors.simulator import Diagnosis\n"
+        "class Own(SapienSimulator):\n"
+        "    @staticmethod\n"
+        "    def diagnose():\n"
+        "        return Diagnosis(False, 'no light', 'buy a lamp')\n"
+    )
+    answer = set_up_graphics(bare, "--backend", "own_backend:Own")
+    assert answer.returncode == 1
+    assert answer.stderr == (
+        "no light.\nbuy a lamp\nsetup: the simulator cannot render; see above\n"
+    )

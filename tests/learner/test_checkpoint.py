@@ -19,6 +19,7 @@ from learner.checkpoint import (
     save_checkpoint,
 )
 from learner.network.subnets import parameter_shapes
+from learner.network_policy import NetworkPolicy
 from proto.config import NetworkConfig, SubnetConfig
 from proto.errors import UserError
 from proto.metrics import Stage
@@ -88,7 +89,7 @@ def test_foreign_safetensors() -> None:
 
 
 def test_metadata_of_another_format(checkpoint: Checkpoint) -> None:
-    values = json.loads(checkpoint.metadata.model_dump_json()) | {"format": 2}
+    values = json.loads(checkpoint.metadata.model_dump_json()) | {"format": 3}
     blob = save(dict(checkpoint.tensors), {"vmdnn": json.dumps(values)})
     with pytest.raises(UserError, match=r"another version of vmdnn"):
         checkpoint_from_bytes(blob, "it")
@@ -111,6 +112,23 @@ def test_tensors_that_do_not_fit(
         checkpoint_from_bytes(checkpoint_bytes(wrong), "it")
 
 
+def with_image_size(checkpoint: Checkpoint, size: object) -> bytes:
+    """The checkpoint as earlier versions wrote it, with an image size among the network's sizes."""
+    metadata = checkpoint.metadata.model_dump(mode="json")
+    metadata["network"]["image"] = size
+    return save(dict(checkpoint.tensors), {"vmdnn": json.dumps(metadata)})
+
+
+def test_an_image_size_in_older_checkpoints_must_be_the_robots(checkpoint: Checkpoint) -> None:
+    older = checkpoint_from_bytes(with_image_size(checkpoint, [64, 48]), "it")
+    assert older.metadata == checkpoint.metadata
+    for size in ([48, 64], [32, 24], None, "64x48"):
+        with pytest.raises(
+            UserError, match=r"it is of a network for images of the size .* 64 x 48"
+        ):
+            checkpoint_from_bytes(with_image_size(checkpoint, size), "it")
+
+
 def test_checkpoint_of_another_network_names_the_fields(checkpoint: Checkpoint) -> None:
     check_same_network(NetworkConfig(), checkpoint, "it")
     other = NetworkConfig(pfc=SubnetConfig(units=20, tau=30), code_margin=0.3)
@@ -121,3 +139,10 @@ def test_checkpoint_of_another_network_names_the_fields(checkpoint: Checkpoint) 
     assert "network.code_margin: 0.2 in the checkpoint, 0.3 in the config" in message
     assert "mstnn" not in message
     assert "units" not in message
+
+
+def test_a_policy_of_format_1_can_be_read() -> None:
+    path = Path(__file__).parents[1] / "data" / "format1" / "policy.safetensors"
+    metadata = load_checkpoint(path).metadata
+    assert (metadata.format, metadata.version, metadata.task) == (1, 1, None)
+    assert NetworkPolicy.from_file(path).step(np.zeros((48, 64), np.uint8)).shape == (11,)

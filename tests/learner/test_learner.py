@@ -11,6 +11,7 @@ from subprocess import Popen
 
 import numpy as np
 import pytest
+from outcomes import NOT_LIFTED
 from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 
@@ -25,7 +26,7 @@ from learner.network_policy import NetworkPolicy
 from learner.tutoring.failures import TRIES
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig, TaskConfig
-from proto.episode import Episode, Kind, Outcome, Reason
+from proto.episode import Episode, Kind
 from proto.keys import Role
 from proto.messages import (
     Command,
@@ -58,7 +59,7 @@ SETTINGS = {
 }
 
 
-FAILED = Outcome(False, False, False, Reason.NOT_LIFTED, 0.0, 1, 2, 3, 4, 5, 80, -1)
+FAILED = NOT_LIFTED
 
 
 def case(number: int, repeat: int, task: str = "experiment1") -> TutoringCase:

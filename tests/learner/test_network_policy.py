@@ -10,11 +10,15 @@ import torch
 from learner.network.vision_input import vision_input
 from learner.network_policy import NetworkPolicy
 from learner.training.trainer import Trainer
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.store import TutoringStore
 from proto.body import ACTION_VALUES
 from proto.config import Config
 from proto.episode import Episode
 from proto.errors import UserError
+from proto.variables import Question
+
+QUESTIONS = (Question("object_y_m", 3), Question("object_yaw_deg", 5))
 
 MakeConfig = Callable[..., Config]
 
@@ -26,7 +30,7 @@ def trainer(
     store = TutoringStore(tmp_path / "tutoring")
     for episode in bar_episodes():
         store.add(episode)
-    trainer = Trainer(small_config(pretraining=1), store)
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=1), QUESTIONS), store)
     trainer.epoch()
     return trainer
 
@@ -39,7 +43,9 @@ def test_acts_as_the_trained_network_would(
     assert (policy.name, policy.version) == ("experiment1", 4)
     images = bar_episodes()[1].images
     with torch.no_grad():
-        outputs = trainer.network(torch.from_numpy(vision_input(images))[None])[0].exp().numpy()
+        outputs = (
+            trainer.recipe.network(torch.from_numpy(vision_input(images))[None])[0].exp().numpy()
+        )
     for _ in range(2):  # every episode begins in the neutral state
         policy.begin({"object_y_m": 0.3}, 1)
         for step, image in enumerate(images):
@@ -53,7 +59,7 @@ def test_acts_as_the_trained_network_would(
 def test_actions_are_within_what_the_robot_accepts(trainer: Trainer) -> None:
     trainer.epoch()
     with torch.no_grad():
-        trainer.network.outputs.bias.view(11, 10)[:, -1] = 100  # all on the last unit
+        trainer.recipe.network.outputs.bias.view(11, 10)[:, -1] = 100  # all on the last unit
     policy = NetworkPolicy.from_bytes(trainer.policy_bytes(1))
     action = policy.step(np.zeros((48, 64), np.uint8))
     for value, told in zip(ACTION_VALUES, action, strict=True):
@@ -83,7 +89,7 @@ def test_pretraining_checkpoint_cannot_act(trainer: Trainer, tmp_path: Path) -> 
 def test_picture_of_another_size_is_refused(trainer: Trainer) -> None:
     trainer.epoch()
     policy = NetworkPolicy.from_bytes(trainer.policy_bytes(1))
-    with pytest.raises(UserError, match=r"\(48, 64\) pictures .* not \(64, 48\)"):
+    with pytest.raises(UserError, match=r"48 x 64 pictures .* not \(64, 48\)"):
         policy.step(np.zeros((64, 48), np.uint8))
 
 

@@ -128,7 +128,7 @@ def test_a_live_step_comes_back_as_it_was() -> None:
         policy="run",
         policy_version=3,
         step=12,
-        phase=2,
+        phase="lift",
         image=random.integers(0, 256, (48, 64), dtype=np.uint8),
         joints_deg=random.uniform(-90, 90, 18).astype(np.float32),
         action=random.uniform(-90, 90, 11).astype(np.float32),
@@ -208,9 +208,12 @@ def test_a_field_of_another_kind_is_refused_by_name(
         (lambda e: e.update(task="\x1b[2J"), "episode.task", "printable"),
         (lambda e: e.update(kind="party"), "episode.kind", "tutoring, correction, trial, practice"),
         (lambda e: e["outcome"].update(strict=1), "episode.outcome.strict", "true or false"),
-        (lambda e: e["situation"].update(x="far"), "episode.situation['x']", "number, got text"),
+        (lambda e: e["situation"].update(x=None), "episode.situation['x']", "number, got nothing"),
+        (lambda e: e["situation"].update(x="a" * 65), "episode.situation['x']", "got 65"),
         (lambda e: e["situation"].update(x=float("nan")), "episode.situation['x']", "got nan"),
-        (lambda e: e["phases"].__setitem__(2, b"\x01\x02\x09"), "episode.phases", "1..8"),
+        (lambda e: e["phases"].__setitem__(2, b"\x01\x02\x09"), "episode", "in phase 9 of 8"),
+        (lambda e: e["outcome"].update(reason="none"), "episode.outcome", "does not fit"),
+        (lambda e: e["outcome"].update(lenient=False), "episode.outcome", "lenient"),
         (
             lambda e: e["actions"].__setitem__(2, np.full((3, 11), np.nan, "<f4").tobytes()),
             "episode.actions",
@@ -247,8 +250,8 @@ def test_another_message_or_version_is_refused(sequence: Sequence) -> None:
     wire = encode(sequence)
     assert wire.encoding == "application/msgpack;vmdnn.sequence.3"
     for encoding in (
-        "application/msgpack;vmdnn.sequence.1",
-        "application/msgpack;vmdnn.rollout.1",
+        "application/msgpack;vmdnn.sequence.2",
+        "application/msgpack;vmdnn.rollout.2",
         "zenoh/bytes",
         "",
     ):

@@ -8,12 +8,13 @@ from pathlib import Path
 from subprocess import Popen
 
 import pytest
+from outcomes import NOT_LIFTED, PRECISE
 from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig
-from proto.episode import Episode, Kind, Outcome, Reason
+from proto.episode import Episode, Kind
 from proto.keys import Role
 from proto.messages import (
     Command,
@@ -30,8 +31,6 @@ from proto.messages import (
 from proto.metrics import EvaluatorMetrics
 
 MakeEpisode = Callable[..., Episode]
-PRECISE = Outcome(True, True, True, Reason.NONE, 0.1, 1, 2, 3, 4, 5, 80, -1)
-NOT_LIFTED = Outcome(False, False, False, Reason.NOT_LIFTED, 0.0, 1, 2, 3, 4, 5, 80, -1)
 
 
 class EvaluatorSetup:

@@ -1,7 +1,4 @@
-"""Whether SAPIEN can render on this machine, and what cures it if not.
-
-`python -m actors.backends.sapien.graphics` prints the answer; exit status 1 means no.
-"""
+"""Whether SAPIEN can render on this machine, and what to install if not."""
 
 from __future__ import annotations
 
@@ -10,10 +7,11 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from actors.simulator import OTHER_SYSTEM, Diagnosis
 from proto.errors import UserError
 
 TIMEOUT_S: Final = 120.0
@@ -26,36 +24,16 @@ SAPIEN renders with Vulkan, also without a GPU. What provides it (as root):
   NVIDIA card: the driver's own Vulkan, of the same version as the kernel module (`nvidia-smi`):
     apt-get install libnvidia-gl-VERSION libvulkan1 (Debian: nvidia-vulkan-icd)
 Runs that need no pictures go without it: --set simulator.render=false"""
+_MESA: Final = ("mesa-vulkan-drivers", "libvulkan1")
+PACKAGES: Final[Mapping[str, tuple[str, ...]]] = {
+    "debian-12": ("-t", "bookworm-backports", *_MESA),  # Debian 12 itself has Mesa 22.3
+    OTHER_SYSTEM: _MESA,
+}
+"""Packages of a driver that has VK_KHR_external_semaphore_fd: Mesa's, from 24.3 on."""
 
 
-@dataclass(frozen=True)
-class GraphicsReport:
-    """What `diagnose` found.
-
-    Attributes:
-        device: name of the device that SAPIEN renders on, empty if it cannot.
-        known: name and driver of every device that Vulkan finds.
-        problem: what is wrong, in one line; empty if nothing.
-    """
-
-    device: str
-    known: tuple[tuple[str, str], ...]
-    problem: str
-
-    @property
-    def works(self) -> bool:
-        """Whether SAPIEN can render."""
-        return not self.problem
-
-    def text(self) -> str:
-        """What to tell the user, in one line if all is well, else with what to do."""
-        if self.works:
-            return f"SAPIEN renders on {self.device}"
-        return f"SAPIEN cannot render: {self.problem}.\n{CURE}"
-
-
-def diagnose() -> GraphicsReport:
-    """Draw a picture in another process and say how that went; takes about a second."""
+def diagnose() -> Diagnosis:
+    """Render a picture in another process and say how that went; takes about a second."""
     probe = Path(__file__).with_name("probe.py")
     environment = {
         **os.environ,
@@ -72,25 +50,30 @@ def diagnose() -> GraphicsReport:
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return GraphicsReport("", (), f"the graphics driver hung for {TIMEOUT_S:.0f} s")
+        return _failed(f"the graphics driver hung for {TIMEOUT_S:.0f} s")
     if result.returncode != 0:
-        return GraphicsReport("", (), _crash(result))
+        return _failed(_crash(result))
     answer = json.loads(result.stdout.splitlines()[-1])
-    known = tuple((name, driver) for name, driver in answer["known"])
-    return GraphicsReport(answer["device"], known, _problem(answer["problem"], known))
+    if answer["problem"]:
+        return _failed(_driver_problem(answer["problem"], answer["known"]))
+    return Diagnosis(True, f"SAPIEN renders on {answer['device']}")
 
 
 @functools.cache
 def require_graphics() -> None:
-    """Return at once if rendering was seen to work in this process before, else try it.
+    """Check that SAPIEN can render; in each process, a success is checked only once.
 
     Raises:
-        UserError: SAPIEN cannot render; the message says what to install. Asked again, it tries
+        UserError: SAPIEN cannot render; the message says what to install. The next call checks
             again.
     """
-    report = diagnose()
-    if not report.works:
-        raise UserError(report.text())
+    diagnosis = diagnose()
+    if not diagnosis.works:
+        raise UserError(diagnosis.text())
+
+
+def _failed(problem: str) -> Diagnosis:
+    return Diagnosis(False, f"SAPIEN cannot render: {problem}", CURE, PACKAGES)
 
 
 def _crash(result: subprocess.CompletedProcess[str]) -> str:
@@ -100,21 +83,8 @@ def _crash(result: subprocess.CompletedProcess[str]) -> str:
     return f"the attempt ended with status {result.returncode}: {last}"
 
 
-def _problem(problem: str, known: tuple[tuple[str, str], ...]) -> str:
-    if not problem:
-        return ""
+def _driver_problem(problem: str, known: list[tuple[str, str]]) -> str:
     if not known:
         return f"no Vulkan driver was found ({problem})"
     listing = ", ".join(f"{name} by {driver}" for name, driver in known)
     return f"the Vulkan driver is too old or incomplete ({listing}: {problem})"
-
-
-def main() -> int:
-    """Print the answer."""
-    report = diagnose()
-    print(report.text())
-    return 0 if report.works else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

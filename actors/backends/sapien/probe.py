@@ -1,7 +1,7 @@
-"""Try to draw one picture; run as a script in a process of its own, for a bad driver can kill it.
+"""Try to render one picture, as a script in its own process, because a bad driver can crash it.
 
-Prints one line of JSON: `device`, the name of the device that drew it, `known`, all devices that
-Vulkan knows with their drivers, and `problem`, what went wrong.
+Prints one line of JSON: `device`, the name of the device that rendered it; `known`, name and driver
+of every device that Vulkan finds; `problem`, what went wrong, empty if nothing did.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from sapien import render
 
 
 def main() -> None:
-    """Draw and report."""
+    """Render and report."""
     device, problem = "", ""
     try:
         system = render.RenderSystem()
-        _draw(system)
+        _render(system)
         device = system.device.name
     except RuntimeError as error:
         problem = str(error)
     print(json.dumps({"device": device, "known": known_devices(), "problem": problem}))
 
 
-def _draw(system: render.RenderSystem) -> None:
+def _render(system: render.RenderSystem) -> None:
     scene = sapien.Scene([system])
     camera = render.RenderCameraComponent(8, 6, str(Path(__file__).parent / "shader"))
     entity = sapien.Entity()
@@ -80,7 +80,7 @@ class _DriverProperties(ctypes.Structure):
 
 
 class _DeviceProperties(ctypes.Structure):
-    """VkPhysicalDeviceProperties2; only the beginning of its properties is spelled out."""
+    """VkPhysicalDeviceProperties2; only the first of its properties are named."""
 
     _fields_ = (
         ("type", ctypes.c_uint32),
@@ -97,7 +97,7 @@ _VULKAN_1_2 = 1 << 22 | 2 << 12
 def known_devices() -> list[tuple[str, str]]:
     """Name and driver of every device that Vulkan finds, whether SAPIEN can use it or not.
 
-    SAPIEN itself says no more than that it found none that it can use.
+    SAPIEN itself only says that it found no device that it can use.
     """
     try:
         vulkan = ctypes.CDLL("libvulkan.so.1")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -11,34 +11,28 @@ from numpy.typing import NDArray
 from sapien import physx
 from sapien.wrapper.urdf_loader import URDFLoader
 
-from actors.simulator import ROBOT, Bodies, Box, Pose, Scene
-from sim_assets.hand import PHALANGES
-from sim_assets.icub import ARM_JOINTS, NECK_JOINTS, Capsule, Collider, Cuboid, IcubModel
+from actors.backends import robot
+from actors.simulator import ROBOT, Array, Bodies, Box, Pose, Scene
+from sim_assets.icub import Capsule, Collider, Cuboid, IcubModel
 
-Floats = NDArray[np.float64]
-
-ROBOT_FRICTION: Final = 1.0
-"""Friction of the robot's skin. PhysX takes the mean of the two materials that touch."""
 POSITION_ITERATIONS: Final = 12
 VELOCITY_ITERATIONS: Final = 1
 CONTACT_OFFSET_M: Final = 0.004
 
-_FINGER_LINKS: Final = frozenset(p.joint.removesuffix("_joint") for p in PHALANGES)
-_STATIC_LINKS: Final = frozenset({"root_link", "torso_1", "torso_2", "chest"})
-# Collision groups: whatever shares a bit of the third group does not touch. So the robot never
-# touches itself, and boxes touch everything.
+# Collision groups of the robot's links. Two shapes pass through each other if their third groups
+# share a bit. So the robot never touches itself; boxes, whose third group is 0, touch everything.
 _ROBOT_GROUPS: Final = [1, 1, 1, 0]
 
 
 class RobotBuilder:
-    """Builds the articulation again and again, reading the URDF once."""
+    """Builds the robot for each scene, but reads the URDF only once."""
 
     def __init__(self, model: IcubModel) -> None:
         loader = URDFLoader()
         loader.set_scene(sapien.Scene([physx.PhysxCpuSystem()]))
         self._builder = loader.load_file_as_articulation_builder(str(model.urdf))
         self._joints = model.joints
-        material = physx.PhysxMaterial(ROBOT_FRICTION, ROBOT_FRICTION, 0.0)
+        material = physx.PhysxMaterial(robot.SKIN_FRICTION, robot.SKIN_FRICTION, 0.0)
         links = {link.name: link for link in self._builder.link_builders}
         for collider in model.colliders:
             links[collider.link].collision_groups = _ROBOT_GROUPS
@@ -47,13 +41,13 @@ class RobotBuilder:
     def build(self, scene: sapien.Scene, height_m: float) -> Any:
         """Put the robot into a scene, its root link `height_m` above the origin."""
         self._builder.set_scene(scene)
-        self._builder.set_initial_pose(_root_pose(height_m))
-        robot = self._builder.build(fix_root_link=True)
-        for link in robot.links:
-            link.disable_gravity = True  # as if the arm's controller compensated for it
+        self._builder.set_initial_pose(sapien.Pose([0.0, 0.0, height_m], robot.ROOT_QUATERNION))
+        articulation = self._builder.build(fix_root_link=True)
+        for link in articulation.links:
+            link.disable_gravity = True  # as if the robot's controller compensated for it
         for name in self._joints:
-            _tune(robot.find_joint_by_name(name))
-        return robot
+            _set_drive(articulation.find_joint_by_name(name), robot.drive_of(name))
+        return articulation
 
 
 def _add_collider(link: Any, collider: Collider, material: Any) -> None:
@@ -67,7 +61,7 @@ def _add_collider(link: Any, collider: Collider, material: Any) -> None:
             link.add_capsule_collision(pose, radius_m, length_m / 2, material)
 
 
-def _along(start: Floats, end: Floats) -> tuple[sapien.Pose, float]:
+def _along(start: Array, end: Array) -> tuple[sapien.Pose, float]:
     """Pose in the middle of a segment, x along it, and its length."""
     axis = end - start
     length = float(np.linalg.norm(axis))
@@ -81,28 +75,15 @@ def _along(start: Floats, end: Floats) -> tuple[sapien.Pose, float]:
     return sapien.Pose(matrix), length
 
 
-def _root_pose(height_m: float) -> sapien.Pose:
-    """Root frame (x back, y right, z up) in the world frame (x right, y forward, z up)."""
-    half = np.sqrt(0.5)
-    return sapien.Pose([0.0, 0.0, height_m], [half, 0.0, 0.0, -half])
-
-
-def _tune(joint: Any) -> None:
-    """Set a joint's drive: stiffness, damping and the greatest torque (Nm)."""
-    if joint.name in ARM_JOINTS:
-        joint.set_drive_properties(400.0, 40.0, 60.0)
-        joint.set_armature(np.full((1, 1), 0.02))
-    elif joint.name in NECK_JOINTS:
-        joint.set_drive_properties(100.0, 10.0, 20.0)
-    else:
-        joint.set_drive_properties(3.0, 0.08, 0.6)
-        joint.set_armature(np.full((1, 1), 1e-5))
+def _set_drive(joint: Any, drive: robot.Drive) -> None:
+    joint.set_drive_properties(drive.stiffness, drive.damping, drive.torque_limit)
+    joint.set_armature(np.full((1, 1), drive.armature))
 
 
 class World:
     """The robot and the boxes of one scene.
 
-    Made anew for each scene: nothing that PhysX remembers from an earlier one can change it.
+    Made anew for each scene, so that nothing PhysX keeps from an earlier scene can change it.
     """
 
     def __init__(
@@ -110,7 +91,7 @@ class World:
         builder: RobotBuilder,
         joints: tuple[str, ...],
         scene: Scene,
-        start_rad: Floats,
+        start_rad: Array,
         period_s: float,
     ) -> None:
         _configure_physics()
@@ -120,22 +101,21 @@ class World:
         self._robot = builder.build(self._scene, scene.table_drop_m)
         order = [joint.name for joint in self._robot.active_joints]
         self._drives = [self._robot.find_joint_by_name(name) for name in joints]
-        self._from_ours = np.array([joints.index(name) for name in order])
-        self._to_ours = np.array([order.index(name) for name in joints])
+        # Position of each of PhysX's joints among the model's, and the other way round.
+        self._model_rows = np.array([joints.index(name) for name in order])
+        self._physx_rows = np.array([order.index(name) for name in joints])
         self._links = {link.name: link for link in self._robot.links}
         self._bodies = {box.name: _add_box(self._scene, box) for box in scene.boxes}
         moving = {box.name for box in scene.boxes if box.mass_kg is not None}
         self._watched = {self._bodies[box.name]: box.name for box in scene.boxes if box.watched}
         self._touchers = dict.fromkeys(self._links.values(), ROBOT)
         self._touchers |= {self._bodies[name]: name for name in moving}
-        self._moving = {self._bodies[name] for name in moving}
-        self._fingers = {link for name, link in self._links.items() if name in _FINGER_LINKS}
         self._places, self._pose_numbers = _in_packed_poses(self._scene)
         self.put(start_rad, {})
         self.drive(start_rad)
 
-    def drive(self, targets_rad: Floats) -> None:
-        """Give every joint (J,) its target."""
+    def drive(self, targets_rad: Array) -> None:
+        """Set the target angles (J,) of all joints."""
         for joint, target in zip(self._drives, targets_rad.tolist(), strict=True):
             joint.set_drive_target(target)
 
@@ -145,31 +125,19 @@ class World:
 
     def touches(self) -> Iterator[tuple[str, str]]:
         """(watched box, toucher) pairs of the physics step that has just run."""
-        for box, other in self._pairs(self._watched, self._touchers):
-            yield self._watched[box], self._touchers[other]
-
-    def finger_contact(self) -> bool:
-        """Whether any finger touched a moving box in the physics step that has just run."""
-        return any(True for _ in self._pairs(self._fingers, self._moving))
-
-    def _pairs(self, ones: Container[Any], others: Container[Any]) -> Iterator[tuple[Any, Any]]:
-        """Touching bodies, the first of `ones`, the second of `others`.
-
-        Bodies touch if they overlap or push each other; PhysX also reports pairs that are near.
-        """
         for contact in self._system.get_contacts():
             first, second = contact.bodies
-            for one, other in ((first, second), (second, first)):
-                if one in ones and other in others and _is_touch(contact):
-                    yield one, other
+            for box, other in ((first, second), (second, first)):
+                if box in self._watched and other in self._touchers and _is_touch(contact):
+                    yield self._watched[box], self._touchers[other]
 
-    def joints_rad(self) -> Floats:
+    def joints_rad(self) -> Array:
         """Measured joint angles (J,)."""
-        return np.asarray(self._robot.qpos[self._to_ours], dtype=np.float64)
+        return np.asarray(self._robot.qpos[self._physx_rows], dtype=np.float64)
 
-    def put(self, joints_rad: Floats, boxes: Mapping[str, Pose]) -> None:
-        """Place the robot, at rest, and boxes."""
-        self._robot.set_qpos(joints_rad[self._from_ours])
+    def put(self, joints_rad: Array, boxes: Mapping[str, Pose]) -> None:
+        """Put the robot, at rest, and some of the boxes where they are told to be."""
+        self._robot.set_qpos(joints_rad[self._model_rows])
         self._robot.set_qvel(np.zeros(len(joints_rad)))
         for name, pose in boxes.items():
             self._bodies[name].entity.set_pose(sapien.Pose(pose.position_m, pose.quaternion))
@@ -186,14 +154,14 @@ class World:
 
 
 def _in_packed_poses(scene: sapien.Scene) -> tuple[dict[str, int], NDArray[np.intp]]:
-    """Rows of the bodies by name, and where the numbers of each row are among packed poses.
+    """Row of each body by name, and the indices (B, 7) of each row's numbers in packed poses.
 
-    A packed pose is the quaternion (w first), then the position.
+    SAPIEN packs a pose as the quaternion (w first), then the position.
     """
     entities = [
         (number, entity.name)
         for number, entity in enumerate(scene.entities)
-        if entity.name not in _STATIC_LINKS
+        if entity.name not in robot.STATIC_LINKS
     ]
     places = {name: row for row, (_, name) in enumerate(entities)}
     starts = np.array([7 * number for number, _ in entities])
@@ -201,7 +169,7 @@ def _in_packed_poses(scene: sapien.Scene) -> tuple[dict[str, int], NDArray[np.in
 
 
 def _configure_physics() -> None:
-    """PhysX keeps these for the whole process."""
+    """Set what PhysX keeps for the whole process."""
     physx.set_body_config(
         solver_position_iterations=POSITION_ITERATIONS,
         solver_velocity_iterations=VELOCITY_ITERATIONS,
@@ -226,4 +194,5 @@ def _add_box(scene: sapien.Scene, box: Box) -> Any:
 
 
 def _is_touch(contact: Any) -> bool:
+    """Whether two bodies overlap or push each other; PhysX also reports pairs that are near."""
     return any(point.separation < 0.0 or point.impulse.any() for point in contact.points)

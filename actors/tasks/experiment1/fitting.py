@@ -2,23 +2,29 @@
 
 Run once, with `python -m actors.tasks.experiment1.fitting`.
 
-Inverse kinematics solved case by case jumps by tens of degrees between neighbouring cases, and a
-network cannot learn from that. So each key posture is a polynomial of the situation, and its
-coefficients are found by nonlinear least squares over a grid of situations at once: the hand where
-it should be, clear of everything it must not touch, within the joints' limits.
+Each key posture is a polynomial of the situation. `actors.posture_fitting` finds its coefficients
+over a grid of situations at once: the hand where it should be, clear of everything it must not
+touch, within the joints' limits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib.resources import as_file
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.kinematics import Arm, ArmPose, Cuboid
-from actors.tasks.contract import Situation
+from actors.kinematics import Arm, ArmPose, ClearanceBox
+from actors.motion import travel
+from actors.posture_fitting import (
+    ANGLE,
+    LIMIT,
+    LOOSE_POSITION,
+    POSITION,
+    fit_polynomial,
+    shortfall,
+)
 from actors.tasks.experiment1.postures import (
     FITTED,
     OBJECT_ORDERS,
@@ -26,9 +32,8 @@ from actors.tasks.experiment1.postures import (
     KeyPostures,
     object_features,
     obstacle_features,
-    travel,
 )
-from actors.tasks.experiment1.task import (
+from actors.tasks.experiment1.world import (
     OBJECT_SIZE_M,
     OBSTACLE_SIZE_M,
     START,
@@ -38,17 +43,10 @@ from actors.tasks.experiment1.task import (
 )
 from proto.body import ARM
 from proto.storage import written_whole
+from proto.variables import Situation, number_of
 from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
 
 Array = NDArray[np.float64]
-Residual = Callable[[Array, int], Array]
-
-# A residual of 1 is one of these: metres, radians.
-POSITION: Final = 0.001
-LOOSE_POSITION: Final = 0.01
-ANGLE: Final = np.deg2rad(1.0)
-CLEARANCE: Final = 0.002
-LIMIT: Final = np.deg2rad(0.5)
 
 OBJECT_MARGIN_M: Final = 0.006
 TABLE_MARGIN_M: Final = 0.004
@@ -59,63 +57,6 @@ LIFT_M: Final = 0.11
 STEEPEST_APPROACH_RAD: Final = np.deg2rad(40.0)
 NEAREST_OBSTACLE: Final[Situation] = {"obstacle_x_m": -0.22}
 """What is done at the object keeps clear of the obstacle wherever it stands."""
-
-
-def fit_polynomial(
-    features: Array, residual: Residual, start: Array, orders: Array, ridge: float = 1.0
-) -> Array:
-    """Levenberg-Marquardt for postures that are linear in `features`.
-
-    Args:
-        features: (N, K) monomials of N situations.
-        residual: residuals of a posture (7,) in radians in situation i.
-        start: (K, 7) coefficients to start from.
-        orders: (K,) order of each monomial; high orders are held small.
-        ridge: weight of that; 1 costs little accuracy and halves the steps from case to case.
-
-    Returns:
-        Coefficients (K, 7) in radians.
-    """
-    weight = (ridge * orders.astype(float) ** 1.5 / ANGLE / 10)[:, None] * np.ones(start.shape[1])
-    coefficients, damping = start, 1e-2
-    values, jacobians, cost = _linearize(features @ coefficients, residual)
-    cost += float(((weight * coefficients) ** 2).sum())
-    for _ in range(60):
-        hessian = np.diag((weight**2).ravel())
-        gradient = (weight**2 * coefficients).ravel()
-        for row, value, jacobian in zip(features, values, jacobians, strict=True):
-            hessian += np.kron(np.outer(row, row), jacobian.T @ jacobian)
-            gradient += np.kron(row, jacobian.T @ value)
-        improved = False
-        while damping < 1e6 and not improved:
-            step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian) + 1e-6), -gradient)
-            trial = coefficients + step.reshape(coefficients.shape)
-            trial_values = [residual(q, i) for i, q in enumerate(features @ trial)]
-            trial_cost = sum(float(v @ v) for v in trial_values)
-            trial_cost += float(((weight * trial) ** 2).sum())
-            improved = trial_cost < cost
-            damping *= 0.2 if improved else 4.0
-        if not improved or cost - trial_cost < 1e-4 * cost:
-            return trial if improved else coefficients
-        coefficients = trial
-        values, jacobians, cost = _linearize(features @ coefficients, residual)
-        cost += float(((weight * coefficients) ** 2).sum())
-    return coefficients
-
-
-def _linearize(postures: Array, residual: Residual) -> tuple[list[Array], list[Array], float]:
-    values, jacobians = [], []
-    for i, posture in enumerate(postures):
-        value = residual(posture, i)
-        columns = [(residual(posture + shift, i) - value) / 1e-5 for shift in 1e-5 * np.eye(7)]
-        values.append(value)
-        jacobians.append(np.stack(columns, axis=1))
-    return values, jacobians, sum(float(value @ value) for value in values)
-
-
-def _short(distance: Array | float, margin: float) -> Array:
-    """How far distances fall short of a margin, in units of CLEARANCE."""
-    return np.asarray(np.maximum(0.0, margin - np.atleast_1d(distance)) / CLEARANCE)
 
 
 class PostureFitter:
@@ -165,12 +106,12 @@ class PostureFitter:
         return np.asarray(np.maximum(0.0, beyond) / LIMIT)
 
     def _table(self, pose: ArmPose, margin: float = TABLE_MARGIN_M) -> Array:
-        return _short(pose.points_m[:, 2] - self._arm.radii_m, margin)
+        return shortfall(pose.points_m[:, 2] - self._arm.radii_m, margin)
 
     def _obstacle(self, pose: ArmPose, situation: Situation, margin: float) -> Array:
-        return _short(self._distances(pose, _obstacle_box(situation)), margin)
+        return shortfall(self._distances(pose, _obstacle_box(situation)), margin)
 
-    def _distances(self, pose: ArmPose, box: Cuboid) -> Array:
+    def _distances(self, pose: ArmPose, box: ClearanceBox) -> Array:
         return np.asarray(box.distance(pose.points_m) - self._arm.radii_m)
 
     def _fit_grasp(self) -> Array:
@@ -192,7 +133,7 @@ class PostureFitter:
                     [offset[2] / (3 * POSITION)],
                     [axis @ along / ANGLE, axis[2] / (4 * ANGLE)],
                     [max(0.0, np.cos(STEEPEST_APPROACH_RAD) - down) / (4 * ANGLE)],
-                    _short(self._distances(pose, box), OBJECT_MARGIN_M),
+                    shortfall(self._distances(pose, box), OBJECT_MARGIN_M),
                     self._table(pose),
                     self._obstacle(pose, NEAREST_OBSTACLE, OBSTACLE_MARGIN_M),
                     self._limits(posture),
@@ -222,7 +163,7 @@ class PostureFitter:
                     [offset[2] / (2 * POSITION * loose)],
                     [axis @ along / (ANGLE * loose), axis[2] / (4 * ANGLE * loose)],
                     turned / (3 * ANGLE * loose),
-                    _short(self._distances(pose, box), OBJECT_MARGIN_M),
+                    shortfall(self._distances(pose, box), OBJECT_MARGIN_M),
                     self._table(pose),
                     self._obstacle(pose, NEAREST_OBSTACLE, OBSTACLE_MARGIN_M),
                     self._limits(posture),
@@ -328,14 +269,14 @@ class PostureFitter:
         return fit_polynomial(self._obstacle_features, residual, over, OBSTACLE_ORDERS)
 
 
-def _object_box(situation: Situation) -> Cuboid:
+def _object_box(situation: Situation) -> ClearanceBox:
     pose = object_pose(situation)
-    yaw = np.deg2rad(-situation["object_yaw_deg"])
-    return Cuboid(np.array(pose.position_m), np.array(OBJECT_SIZE_M), float(yaw))
+    yaw = np.deg2rad(-number_of(situation, "object_yaw_deg"))
+    return ClearanceBox(np.array(pose.position_m), np.array(OBJECT_SIZE_M), float(yaw))
 
 
-def _obstacle_box(situation: Situation) -> Cuboid:
-    return Cuboid(np.array(obstacle_pose(situation).position_m), np.array(OBSTACLE_SIZE_M))
+def _obstacle_box(situation: Situation) -> ClearanceBox:
+    return ClearanceBox(np.array(obstacle_pose(situation).position_m), np.array(OBSTACLE_SIZE_M))
 
 
 def main() -> None:

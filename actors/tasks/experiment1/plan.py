@@ -7,20 +7,20 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from actors.attention import clip_action
 from actors.kinematics import Gaze
-from actors.tasks.contract import Situation
-from actors.tasks.experiment1.postures import KeyPostures, load_key_postures, travel
-from actors.tasks.experiment1.task import (
+from actors.motion import minimum_jerk, ramp, travel
+from actors.tasks.experiment1.postures import KeyPostures, load_key_postures
+from actors.tasks.experiment1.world import (
     START,
     SUBTASKS,
     TABLE_DROP_M,
     object_pose,
     obstacle_pose,
 )
-from proto.body import ACTION_SIZE, ARM, FOCUS, GRASP, NECK
+from proto.body import ARM, FOCUS, GRASP, NECK
+from proto.variables import Situation
 
 Array = NDArray[np.float64]
 
@@ -34,12 +34,6 @@ OBSTACLE_GAZE_M: Final = np.array([0.0, -0.05, 0.06])
 """Where on the obstacle the robot looks, from its centre: the upper edge near the hand."""
 
 
-def minimum_jerk(share: Array | float) -> Array:
-    """Position 0..1 of a minimum-jerk movement at a share 0..1 of its time (Flash & Hogan 1985)."""
-    s = np.clip(share, 0.0, 1.0)
-    return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s * s))
-
-
 def plan(situation: Situation) -> Array:
     """Actions (T, 11) that carry out Experiment I in a situation (see `proto.body`)."""
     steps = dict(zip(SUBTASKS, np.cumsum([0, *SUBTASKS.values()]), strict=False))
@@ -47,9 +41,9 @@ def plan(situation: Situation) -> Array:
     actions = np.tile(START, (total, 1))
     actions[:, ARM] = _arm(situation, load_key_postures())
     actions[:, NECK] = _neck(situation, steps)
-    closing = _ramp(total, steps["grasp"], CLOSING_STEPS)
+    closing = ramp(total, steps["grasp"], CLOSING_STEPS)
     actions[:, GRASP] = 1.0 + 9.0 * closing
-    actions[:, FOCUS] = 1.0 + 19.0 * _ramp(total, steps["descend"], FOCUS_STEPS)
+    actions[:, FOCUS] = 1.0 + 19.0 * ramp(total, steps["descend"], FOCUS_STEPS)
     return clip_action(actions)  # between key postures a joint may pass its limit by a degree
 
 
@@ -58,18 +52,13 @@ def _gaze() -> Gaze:
     return Gaze(TABLE_DROP_M)
 
 
-def _ramp(total: int, start: int, length: int) -> Array:
-    """0 before step `start`, 1 from `length` steps later, minimum jerk between; (total,)."""
-    return minimum_jerk((np.arange(total) + 1 - start) / length)
-
-
 def _neck(situation: Situation, steps: dict[str, int]) -> Array:
     """Neck pitch and yaw (T, 2): the task space, then the obstacle, then the object."""
     total = sum(SUBTASKS.values())
     at_obstacle = _gaze().neck_deg(np.array(obstacle_pose(situation).position_m) + OBSTACLE_GAZE_M)
     at_object = _gaze().neck_deg(np.array(object_pose(situation).position_m))
-    first = _ramp(total, steps["attend obstacle"], GAZE_STEPS)[:, None]
-    second = _ramp(total, steps["attend object"], GAZE_STEPS)[:, None]
+    first = ramp(total, steps["attend obstacle"], GAZE_STEPS)[:, None]
+    second = ramp(total, steps["attend object"], GAZE_STEPS)[:, None]
     return np.asarray(
         START[NECK] + (at_obstacle - START[NECK]) * first + (at_object - at_obstacle) * second
     )
@@ -98,24 +87,3 @@ def _arm(situation: Situation, postures: KeyPostures) -> Array:
             through("grasp", "lift_1", "lift_2", moving=LIFTING_STEPS, total=n["lift"]),
         ]
     )
-
-
-def execution_noise(steps: int, seed: int, amplitude_deg: float, correlation_steps: float) -> Array:
-    """Smooth noise (T, 11) on neck and arm, zero at the first step and on grasp and focus.
-
-    Args:
-        steps: number of control steps T.
-        seed: the same seed gives the same noise.
-        amplitude_deg: its standard deviation (degrees).
-        correlation_steps: time over which it stays alike (control steps).
-    """
-    random = np.random.default_rng(seed)
-    noise = np.zeros((steps, ACTION_SIZE))
-    joints = np.r_[NECK, ARM]
-    margin = int(4 * correlation_steps)
-    white = random.standard_normal((steps + 2 * margin, len(joints)))
-    smooth = gaussian_filter1d(white, correlation_steps / np.sqrt(2), axis=0)
-    smooth /= np.sqrt(1.0 / (2.0 * np.sqrt(np.pi) * correlation_steps / np.sqrt(2)))
-    fade_in = minimum_jerk((np.arange(steps) + 1) / correlation_steps)[:, None]
-    noise[:, joints] = amplitude_deg * smooth[margin : margin + steps] * fade_in
-    return noise

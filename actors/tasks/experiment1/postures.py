@@ -7,7 +7,6 @@ give neighbouring trajectories. `actors.tasks.experiment1.fitting` found the coe
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -15,9 +14,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
-from actors.tasks.contract import Situation
+from proto.variables import Situation, number_of
 
 Array = NDArray[np.float64]
 
@@ -32,14 +30,14 @@ _OBSTACLE_POWERS: Final = (0, 1, 2)
 
 def object_features(situation: Situation) -> Array:
     """Monomials (12,) of the object's Y and yaw, both scaled to -1..1 over the ranges."""
-    y = (situation["object_y_m"] - 0.25) / 0.05
-    yaw = situation["object_yaw_deg"] / 45.0
+    y = (number_of(situation, "object_y_m") - 0.25) / 0.05
+    yaw = number_of(situation, "object_yaw_deg") / 45.0
     return np.array([y**a * yaw**b for a, b in _OBJECT_POWERS])
 
 
 def obstacle_features(situation: Situation) -> Array:
     """Monomials (3,) of the obstacle's X, scaled to -1..1 over its range."""
-    x = (situation["obstacle_x_m"] + 0.27) / 0.05
+    x = (number_of(situation, "obstacle_x_m") + 0.27) / 0.05
     return np.array([x**power for power in _OBSTACLE_POWERS])
 
 
@@ -75,12 +73,6 @@ class KeyPostures:
             "obstacle": {name: rows.round(4).tolist() for name, rows in self.obstacle.items()},
         }
         return json.dumps(values, indent=1) + "\n"
-
-
-def travel(postures: Sequence[Array], share: Array | float) -> Array:
-    """A smooth way through postures (each (7,)), evenly spaced over shares 0..1; (..., 7)."""
-    way = CubicSpline(np.linspace(0.0, 1.0, len(postures)), np.stack(postures))
-    return np.asarray(way(share))
 
 
 FITTED: Final = files("actors.tasks.experiment1").joinpath("postures.json")

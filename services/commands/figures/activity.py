@@ -8,6 +8,7 @@ from typing import Final
 
 from actors.policies.by_name import make_policy
 from actors.policies.contract import StatefulPolicy
+from actors.tasks.registry import make_task
 from proto.errors import UserError
 from proto.recordings.episodes import read_episode
 from services.arguments.common import add_config, config_of
@@ -39,7 +40,7 @@ def draw(arguments: argparse.Namespace) -> Drawn:
 
 
 def _stateful_policy(arguments: argparse.Namespace) -> StatefulPolicy:
-    policy = make_policy(arguments.policy, config_of(arguments))
+    policy = make_policy(arguments.policy, make_task(config_of(arguments).task))
     if not isinstance(policy, StatefulPolicy):
         raise UserError(f"--policy {arguments.policy} has no states; name a network's checkpoint")
     return policy

@@ -16,7 +16,7 @@ from services.figures import corrections
 from services.figures.corrections import Curve
 from services.figures.drawn import Drawn
 from services.terminal.progress import progress_bar
-from services.trials import round_trials as lap_trials
+from services.trials import round_trials
 from services.trials.round_trials import Run
 from services.trials.success import Tally
 
@@ -45,12 +45,14 @@ def draw(arguments: argparse.Namespace) -> Drawn:
             f"--seed {arguments.seed}: with seeds of {TRIALS_BELOW} and more a run may have been"
             " tutored; take a smaller one"
         )
-    runs = [lap_trials.open_run(folder) for folder in arguments.runs]
+    runs = [round_trials.open_run(folder) for folder in arguments.runs]
     try:
         curves = [_curve(run, arguments) for run in runs]
     except KeyboardInterrupt:
-        told = Console(stderr=True)
-        told.print("stopped; the same command goes on with what was counted in the runs' folders")
+        console = Console(stderr=True)
+        console.print(
+            "stopped; the same command goes on with what was counted in the runs' folders"
+        )
         raise
     return Drawn(
         corrections.draw(curves),
@@ -65,12 +67,12 @@ def draw(arguments: argparse.Namespace) -> Drawn:
 
 def _curve(run: Run, arguments: argparse.Namespace) -> Curve:
     tallies = []
-    for lap_end in run.lap_ends:
-        words = f"{run.config.run.name}, policy {lap_end.version}"
-        with progress_bar(words, arguments.trials) as advance:
-            outcomes = lap_trials.test(
+    for policy in run.policies:
+        label = f"{run.config.run.name}, policy {policy.version}"
+        with progress_bar(label, arguments.trials) as advance:
+            outcomes = round_trials.play_trials(
                 run,
-                lap_end,
+                policy,
                 arguments.trials,
                 arguments.seed,
                 workers=arguments.workers,

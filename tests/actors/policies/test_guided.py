@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.player import play
-from actors.policies.by_name import BASELINES, PlannedPolicy, make_tutor
 from actors.policies.guided import FOCUS_SLACK, GRASP_SLACK, GuidedPolicy
+from actors.policies.planned import PlannedPolicy, make_tutor
 from actors.simulator import make_simulator
 from actors.tasks.experiment1.plan import plan
-from actors.tasks.experiment1.task import Experiment1
+from actors.tasks.registry import make_task
 from proto.body import FOCUS, GRASP
-from proto.config import Config, SimulatorConfig
+from proto.config import SimulatorConfig, TaskConfig
 from proto.episode import Episode, Image, Kind
 
-TASK = Experiment1()
+TASK = make_task(TaskConfig())
 SITUATION = {"obstacle_x_m": -0.24, "object_y_m": 0.28, "object_yaw_deg": 40.0}
 
 
@@ -25,7 +25,7 @@ class Shifted(PlannedPolicy):
     version = 7
 
     def __init__(self, by: float) -> None:
-        super().__init__("shifted", lambda situation: situation)
+        super().__init__("shifted", TASK, lambda situation: situation)
         self._by = by
 
     def step(self, image: Image) -> NDArray[np.float64]:
@@ -33,7 +33,7 @@ class Shifted(PlannedPolicy):
 
 
 def guided(policy: PlannedPolicy, guidance_deg: float) -> Episode:
-    tutor = make_tutor(Config(), noisy=False)
+    tutor = make_tutor(TASK)
     simulator = make_simulator(SimulatorConfig(render=False))
     try:
         given = GuidedPolicy(policy, tutor, guidance_deg)
@@ -45,7 +45,7 @@ def guided(policy: PlannedPolicy, guidance_deg: float) -> Episode:
 def test_small_errors_are_left_and_large_ones_held() -> None:
     meant = plan(SITUATION)
     for by, guidance_deg in ((0.5, 5.0), (-7.0, 5.0), (7.0, 0.0)):
-        policy = GuidedPolicy(Shifted(by), make_tutor(Config(), noisy=False), guidance_deg)
+        policy = GuidedPolicy(Shifted(by), make_tutor(TASK), guidance_deg)
         policy.begin(SITUATION, 0)
         off = [policy.step(np.zeros((48, 64), np.uint8)) - step for step in meant]
         assert policy.version == 7
@@ -56,7 +56,7 @@ def test_small_errors_are_left_and_large_ones_held() -> None:
 
 def test_a_policy_that_sees_nothing_is_brought_to_its_goal() -> None:
     # alone it comes with the hand turned wrong, and shoves the object
-    blind = PlannedPolicy("yaw-blind", BASELINES["yaw-blind"])
+    blind = PlannedPolicy("yaw-blind", TASK, TASK.baselines["yaw-blind"])
     episode = guided(blind, guidance_deg=2.0)
     assert episode.outcome.strict, episode.outcome
     assert (episode.kind, episode.policy, episode.policy_version) == (Kind.CORRECTION, "guided", 0)

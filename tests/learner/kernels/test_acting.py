@@ -1,178 +1,76 @@
-"""The compiled network that acts gives the numbers of the one in numpy."""
+"""The compiled network that acts: its parameters, its arrays and its state.
+
+`tests/learner/network/test_compiled_network.py` compares its numbers with numpy's.
+"""
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Mapping
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from learner.kernels import acting
-from learner.kernels.acting import CompiledNetwork
-from learner.network.numpy_network import NumpyNetwork, make_acting_network
-from learner.network.subnets import parameter_shapes
-from proto.config import NetworkConfig
+from learner.kernels.acting import ActingKernel, LevelSizes, MapsSizes, NetworkSizes
 
-Floats = NDArray[np.float32]
+SIZES = NetworkSizes(
+    image=(11, 14),
+    maps=(MapsSizes(2, 4, 5, 5, 6, 2, tau=2.0), MapsSizes(3, 2, 3, 3, 3, 1, tau=5.0)),
+    levels=(LevelSizes(4, 20.0), LevelSizes(5, 5.0), LevelSizes(6, 2.0)),
+    values=3,
+    softmax_units=4,
+    literal=False,
+)
+COUNT = (
+    2 * (30 + 1)
+    + 3 * (18 + 1)
+    + 4 * (18 + 4 + 5 + 1)
+    + 5 * (4 + 5 + 6 + 1)
+    + 6 * (5 + 6 + 1)
+    + 12 * 7
+)
+
+
+def parameters(count: int = COUNT) -> Sequence[NDArray[np.float32]]:
+    return [np.random.default_rng(1).normal(size=count).astype(np.float32) / 3]
+
+
+def run(kernel: ActingKernel, images: NDArray[np.float32]) -> NDArray[np.float32]:
+    outputs = []
+    for image in images:
+        kernel.image[:] = image
+        kernel.see()
+        kernel.act()
+        outputs.append(kernel.outputs.copy())
+    return np.array(outputs)
 
 
 @pytest.fixture
-def _compiled() -> None:
-    if not acting.available():
-        pytest.skip("the C++ kernels are not compiled here")
+def images() -> NDArray[np.float32]:
+    return np.random.default_rng(2).uniform(-1, 1, (5, 11, 14)).astype(np.float32)
 
 
-def parameters_of(config: NetworkConfig, limit: float = 0.5, seed: int = 1) -> Mapping[str, Floats]:
-    random = np.random.default_rng(seed)
-    return {
-        name: random.uniform(-limit, limit, shape).astype(np.float32)
-        for name, shape in parameter_shapes(config).items()
-    }
+def test_it_has_a_state_until_it_is_reset(images: NDArray[np.float32]) -> None:
+    kernel = ActingKernel(SIZES, parameters())
+    first = run(kernel, images)
+    assert not np.array_equal(run(kernel, images), first)
+    kernel.reset()
+    np.testing.assert_array_equal(run(kernel, images), first)
+    np.testing.assert_allclose(first.sum(-1), 1.0, rtol=1e-5)
 
 
-def pictures_for(config: NetworkConfig, steps: int, seed: int = 2) -> Floats:
-    width, height = config.image
-    random = np.random.default_rng(seed)
-    return random.uniform(-1, 1, (steps, height, width)).astype(np.float32)
-
-
-def in_double(config: NetworkConfig, parameters: Mapping[str, Floats]) -> NumpyNetwork:
-    return NumpyNetwork(
-        config, {name: values.astype(np.float64) for name, values in parameters.items()}
-    )
-
-
-def worst_error(config: NetworkConfig, steps: int, limit: float) -> float:
-    """Largest distance of an output from what float64 gives."""
-    parameters = parameters_of(config, limit)
-    network, reference = CompiledNetwork(config, parameters), in_double(config, parameters)
-    return max(
-        float(np.abs(network.step(picture) - reference.step(picture.astype(np.float64))).max())
-        for picture in pictures_for(config, steps)
-    )
-
-
-@st.composite
-def networks(draw: st.DrawFn) -> NetworkConfig:
-    """Networks of any sizes whose kernels fit."""
-
-    def maps(width: int, height: int) -> dict[str, object]:
-        return {
-            "maps": draw(st.integers(1, 7)),
-            "kernel": (draw(st.integers(1, width)), draw(st.integers(1, height))),
-            "stride": draw(st.integers(1, 4)),
-            "tau": draw(st.floats(1, 50)),
-        }
-
-    def level() -> dict[str, object]:
-        return {"units": draw(st.integers(1, 40)), "tau": draw(st.floats(1, 200))}
-
-    def units(below: int, kernel: int, stride: int) -> int:
-        return (below - kernel) // stride + 1
-
-    width, height = draw(st.integers(1, 70)), draw(st.integers(1, 30))
-    fast = maps(width, height)
-    kernel_width, kernel_height = fast["kernel"]
-    return NetworkConfig.model_validate(
-        {
-            "image": (width, height),
-            "mstnn_fast": fast,
-            "mstnn_slow": maps(
-                units(width, kernel_width, fast["stride"]),
-                units(height, kernel_height, fast["stride"]),
-            ),
-            "pfc": level(),
-            "mtrnn_slow": level(),
-            "mtrnn_fast": level(),
-            "softmax_units": draw(st.integers(2, 20)),
-            "update_order": draw(st.sampled_from(["bottom_up", "literal"])),
-        }
-    )
-
-
-@pytest.mark.usefixtures("_compiled")
-@settings(max_examples=100)
-@given(config=networks())
-def test_any_network_gives_the_numbers_of_numpy(config: NetworkConfig) -> None:
-    weights = max(np.prod(shape[1:]) for shape in parameter_shapes(config).values())
-    assert worst_error(config, steps=6, limit=2 / np.sqrt(weights)) < 3e-6
-
-
-@pytest.mark.usefixtures("_compiled")
-@pytest.mark.parametrize("order", ["bottom_up", "literal"])
-def test_the_papers_network_gives_the_numbers_of_numpy_through_a_whole_episode(order: str) -> None:
-    config = NetworkConfig.model_validate({"update_order": order})
-    assert worst_error(config, steps=130, limit=0.2) < 3e-6
-
-
-@pytest.mark.usefixtures("_compiled")
-def test_large_potentials_saturate() -> None:
-    config = NetworkConfig()
-    parameters = parameters_of(config, limit=30.0)
-    network = CompiledNetwork(config, parameters)
-    outputs = np.array([network.step(picture) for picture in pictures_for(config, 20)])
-    assert np.isfinite(outputs).all()
-    np.testing.assert_allclose(outputs.sum(-1), 1.0, rtol=1e-5)
-
-
-@pytest.mark.usefixtures("_compiled")
-@pytest.mark.parametrize("order", ["bottom_up", "literal"])
-def test_reset_returns_to_the_neutral_state(order: str) -> None:
-    config = NetworkConfig.model_validate({"update_order": order})
-    network, pictures = CompiledNetwork(config, parameters_of(config)), pictures_for(config, 5)
-    first = [network.step(picture) for picture in pictures]
-    assert not np.array_equal(network.step(pictures[0]), first[0])
-    network.reset()
-    np.testing.assert_array_equal([network.step(picture) for picture in pictures], first)
-
-
-@pytest.mark.usefixtures("_compiled")
-def test_networks_have_states_of_their_own() -> None:
-    config = NetworkConfig()
-    parameters, pictures = parameters_of(config), pictures_for(config, 4)
-    alone = CompiledNetwork(config, parameters)
-    expected = [alone.step(picture) for picture in pictures]
-    one, other = CompiledNetwork(config, parameters), CompiledNetwork(config, parameters)
-    steps = []
-    for picture in pictures:
-        steps.append(one.step(picture))
-        other.step(-picture)
+def test_networks_have_states_of_their_own(images: NDArray[np.float32]) -> None:
+    expected = run(ActingKernel(SIZES, parameters()), images)
+    one, other = ActingKernel(SIZES, parameters()), ActingKernel(SIZES, parameters())
+    first = run(one, images[:2])
+    run(other, -images)
     del other
     gc.collect()
-    np.testing.assert_array_equal(steps, expected)
-    np.testing.assert_array_equal(steps[0], expected[0])
+    np.testing.assert_array_equal(np.concatenate([first, run(one, images[2:])]), expected)
 
 
-@pytest.mark.usefixtures("_compiled")
-def test_wrong_sizes_are_refused() -> None:
-    config = NetworkConfig()
-    network = CompiledNetwork(config, parameters_of(config))
-    with pytest.raises(ValueError, match="broadcast"):
-        network.step(np.zeros((64, 48), np.float32))
-    with pytest.raises(ValueError, match="broadcast"):
-        network.act(np.zeros(7, np.float32))
-    other = parameters_of(NetworkConfig(softmax_units=7))
-    with pytest.raises(ValueError, match=r"outputs\.input"):
-        CompiledNetwork(config, other)
-
-
-def test_without_a_compiler_numpy_acts(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: object, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
-    monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
-    acting._library.cache_clear()
-    try:
-        config = NetworkConfig()
-        for _ in range(2):
-            network = make_acting_network(config, parameters_of(config))
-            assert isinstance(network, NumpyNetwork)
-    finally:
-        acting._library.cache_clear()
-    assert len([line for line in caplog.messages if "no C++ compiler" in line]) == 1
+@pytest.mark.parametrize("count", [COUNT - 1, COUNT + 1])
+def test_parameters_that_do_not_fit_are_refused(count: int) -> None:
+    with pytest.raises(ValueError, match=f"there are {count} parameters, not {COUNT}"):
+        ActingKernel(SIZES, parameters(count))

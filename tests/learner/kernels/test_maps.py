@@ -8,20 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from learner.kernels import maps as kernels
-from learner.kernels.build import NotCompiledError, find_or_compile
+from learner.kernels import maps as kernel
 from learner.network.mstnn import Maps
 from learner.network.subnets import Subnet
 
 DOUBLE = torch.float64
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled() -> None:
-    try:
-        find_or_compile()
-    except NotCompiledError as error:
-        pytest.skip(f"the C++ kernels are not compiled here: {error}")
 
 
 @st.composite
@@ -82,4 +73,4 @@ def test_second_derivatives_are_refused() -> None:
 
 def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(ValueError, match="below"):
-        kernels.maps(torch.ones(1, 1, 2, 5, 5), torch.ones(1, 3, 2, 2), torch.ones(1), 1, 2.0)
+        kernel.maps(torch.ones(1, 1, 2, 5, 5), torch.ones(1, 3, 2, 2), torch.ones(1), 1, 2.0)

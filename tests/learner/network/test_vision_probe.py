@@ -9,13 +9,24 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from actors.tasks.experiment1.world import SUBTASKS
 from learner.checkpoint import checkpoint_from_bytes, load_checkpoint
-from learner.network.vision_probe import PENALTIES, Vision, ask_classifier, probe, ridge_regression
+from learner.network.vision_probe import (
+    PENALTIES,
+    Vision,
+    ridge_regression,
+    score_classifier,
+    score_regression,
+)
 from learner.training.trainer import Trainer
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.store import TutoringStore
 from proto.config import Config
 from proto.episode import Episode
 from proto.errors import UserError
+from proto.variables import Question
+
+QUESTIONS = (Question("object_y_m", 3), Question("object_yaw_deg", 5))
 
 MakeEpisodes = Callable[..., Sequence[Episode]]
 Array = NDArray[np.float64]
@@ -33,7 +44,7 @@ def trainer(
     store = TutoringStore(tmp_path_factory.mktemp("tutoring"))
     for episode in bar_episodes(**LEARNED):
         store.add(episode)
-    trainer = Trainer(small_config(pretraining=40), store)
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=40), QUESTIONS), store)
     for _ in range(40):
         trainer.epoch()
     return trainer
@@ -49,7 +60,7 @@ def vision(trainer: Trainer, tmp_path: Path) -> Vision:
 def test_the_classifier_answers_as_it_has_learned(
     vision: Vision, bar_episodes: MakeEpisodes
 ) -> None:
-    learned = ask_classifier(vision, bar_episodes(**LEARNED))
+    learned = score_classifier(vision, bar_episodes(**LEARNED))
     assert [(answer.value, answer.classes) for answer in learned] == [
         ("object_y_m", 3),
         ("object_yaw_deg", 5),
@@ -63,23 +74,23 @@ def test_the_classifier_answers_as_it_has_learned(
     ]
     for episode in nothing:
         episode.images[:] = 0
-    assert ask_classifier(vision, nothing)[0].error > 0.03
+    assert score_classifier(vision, nothing)[0].error > 0.03
 
 
 def test_a_policy_has_no_classifier(trainer: Trainer, bar_episodes: MakeEpisodes) -> None:
     trainer.epoch()
     policy = Vision(checkpoint_from_bytes(trainer.policy_bytes(1), "policy"))
-    assert ask_classifier(policy, bar_episodes()) == []
-    assert probe(policy, bar_episodes(), bar_episodes())
+    assert score_classifier(policy, bar_episodes()) == []
+    assert score_regression(policy, bar_episodes(), bar_episodes())
 
 
 def test_the_vision_tells_what_lies_between_the_classes(
     vision: Vision, bar_episodes: MakeEpisodes
 ) -> None:
-    probes = probe(vision, bar_episodes(**LEARNED), bar_episodes(**OTHERS))
-    assert {told.value for told in probes} == {"object_y_m", "object_yaw_deg"}
-    assert [told.phase for told in probes] == sorted(told.phase for told in probes)
-    last = {told.value: told for told in probes if told.phase == 8}
+    scores = score_regression(vision, bar_episodes(**LEARNED), bar_episodes(**OTHERS))
+    assert {score.value for score in scores} == {"object_y_m", "object_yaw_deg"}
+    assert list(dict.fromkeys(score.phase for score in scores)) == list(SUBTASKS)
+    last = {score.value: score for score in scores if score.phase == "lift"}
     assert last["object_y_m"].blind_error == pytest.approx(0.025)
     assert last["object_y_m"].error < 0.4 * 0.025
 
@@ -89,7 +100,7 @@ def test_nothing_can_be_asked_of_sequences_that_are_all_alike(
 ) -> None:
     alike = bar_episodes(places=(0.5,), slopes=(0.5,))
     with pytest.raises(UserError, match="no varying value"):
-        probe(vision, alike, bar_episodes())
+        score_regression(vision, alike, bar_episodes())
 
 
 def refitted(features: Array, values: Array, penalty: float, others: Array) -> Array:

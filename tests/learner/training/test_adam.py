@@ -18,7 +18,7 @@ SHAPES = [(7, 5), (3,), (2, 3, 4)]  # together no multiple of a vector's lanes
 @pytest.fixture(params=["compiled", "PyTorch"], autouse=True)
 def _each_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     if request.param == "PyTorch":
-        monkeypatch.setattr("learner.training.adam.kernel.serves", lambda _: False)
+        monkeypatch.setattr("learner.training.adam.kernel.supports", lambda _: False)
         return
     try:
         find_or_compile()
@@ -43,14 +43,14 @@ def learn(adam: Adam, parameters: Sequence[nn.Parameter], numbers: range) -> Non
 
 
 def learn_as_pytorch(
-    parameters: Sequence[nn.Parameter], numbers: range, longest: float | None
+    parameters: Sequence[nn.Parameter], numbers: range, max_norm: float | None
 ) -> torch.optim.Adam:
     adam = torch.optim.Adam(parameters)
     for number in numbers:
         for parameter, gradient in zip(parameters, draw(number), strict=True):
             parameter.grad = gradient
-        if longest is not None:
-            nn.utils.clip_grad_norm_(parameters, longest)
+        if max_norm is not None:
+            nn.utils.clip_grad_norm_(parameters, max_norm)
         adam.param_groups[0]["lr"] = 0.1 / number
         adam.step()
     return adam
@@ -63,14 +63,14 @@ def assert_alike(
         torch.testing.assert_close(result.to(DOUBLE), right, rtol=tolerance, atol=tolerance)
 
 
-@pytest.mark.parametrize("longest", [None, 0.5, 100.0])
+@pytest.mark.parametrize("max_norm", [None, 0.5, 100.0])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(DOUBLE, 1e-12), (torch.float32, 1e-5)])
 def test_steps_are_those_of_pytorch(
-    longest: float | None, dtype: torch.dtype, tolerance: float
+    max_norm: float | None, dtype: torch.dtype, tolerance: float
 ) -> None:
     results, expected = parameters_of(dtype), parameters_of()
-    learn(Adam(results, longest), results, range(1, 20))
-    learn_as_pytorch(expected, range(1, 20), longest)
+    learn(Adam(results, max_norm), results, range(1, 20))
+    learn_as_pytorch(expected, range(1, 20), max_norm)
     assert_alike(results, expected, tolerance)
 
 

@@ -1,18 +1,18 @@
-"""Disturbed pictures: whole sequences are shifted, each its own way."""
+"""Augmented images: whole sequences are shifted, each in its own direction."""
 
 from __future__ import annotations
 
 import torch
 
-from learner.training.augmentation import disturbed
+from learner.training.augmentation import augment
 from proto.config import PretrainingConfig
 
 
-def test_disturbed_pictures_are_shifted_whole_and_differ_between_sequences() -> None:
+def test_augmented_images_are_shifted_whole_and_differ_between_sequences() -> None:
     images = torch.rand(6, 5, 12, 16)
     config = PretrainingConfig(image_shift=2, image_gain=0, image_noise=0)
     shifts = []
-    after_all = disturbed(images, config, torch.Generator().manual_seed(1))
+    after_all = augment(images, config, torch.Generator().manual_seed(1))
     for before, after in zip(images, after_all, strict=True):
         fits = [
             (down, right)
@@ -27,7 +27,7 @@ def test_disturbed_pictures_are_shifted_whole_and_differ_between_sequences() -> 
     assert len(set(shifts)) > 1
 
 
-def test_undisturbed_pictures_stay_as_they_are() -> None:
+def test_amplitudes_of_zero_change_nothing() -> None:
     images = torch.rand(2, 5, 12, 16)
     config = PretrainingConfig(image_shift=0, image_gain=0, image_noise=0)
-    assert torch.equal(disturbed(images, config, torch.Generator()), images)
+    assert torch.equal(augment(images, config, torch.Generator()), images)

@@ -1,4 +1,4 @@
-"""All ways to compute the loss and its gradients agree with the plain one, in float64."""
+"""All ways to compute the loss and its gradients agree with the stepwise one, in float64."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from learner.bench.reference import plain_divergence
-from learner.kernels import cpu
+from learner.bench.reference import stepwise_divergence
+from learner.kernels import core
 from learner.kernels.build import NotCompiledError, find_or_compile
 from learner.kernels.library import learning_library
 from learner.network.vmdnn import VMDNN
 from learner.training.divergence import add_gradients, divergence, reference_divergence
-from learner.training.sequences import Sequences
+from learner.training.sequences import Minibatch, Sequences
 from proto.config import NetworkConfig
 
-Loss = Callable[[VMDNN, Sequences, Tensor, Tensor | None, Tensor | None], Tensor]
+Loss = Callable[[VMDNN, Minibatch], Tensor]
 DOUBLE = torch.float64
 
 
@@ -44,8 +44,7 @@ def configs(draw: st.DrawFn) -> NetworkConfig:
 
     return NetworkConfig.model_validate(
         {
-            "image": (8, 6),
-            "mstnn_fast": {"maps": 1, "kernel": (4, 3), "stride": 1, "tau": 2},
+            "mstnn_fast": {"maps": 1, "kernel": (60, 45), "stride": 1, "tau": 2},
             "mstnn_slow": {"maps": draw(sizes), "kernel": (3, 3), "stride": 1, "tau": 2},
             "pfc": level(),
             "mtrnn_slow": level(),
@@ -90,10 +89,21 @@ def loss_and_gradients(
     generator = torch.Generator().manual_seed(3)
     shift = torch.randn(len(chosen), seen.shape[2], generator=generator, dtype=DOUBLE)
     shift = shift.to(seen.dtype).requires_grad_()
-    value = loss(network, Sequences(**{**vars(sequences), "seen": seen}), chosen, initial, shift)
+    differentiable = Sequences(**{**vars(sequences), "seen": seen})
+    value = loss(network, Minibatch(differentiable, chosen, initial, shift))
     by = [*network.core_parameters(), seen, initial, shift]
     gradients = torch.autograd.grad(3 * value, by, allow_unused=True, materialize_grads=True)
     return [value.detach(), *gradients]
+
+
+def in_single_precision(
+    network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor
+) -> list[Tensor]:
+    """What the kernel computes in float32."""
+    single = VMDNN(network.config)
+    single.load_state_dict(network.state_dict())
+    narrowed = as_type(sequences, torch.float32)
+    return loss_and_gradients(divergence, single, narrowed, chosen, initial.float())
 
 
 def assert_alike(results: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
@@ -112,7 +122,7 @@ def assert_alike(results: list[Tensor], expected: list[Tensor], tolerance: float
     lengths=st.lists(st.integers(1, 40), min_size=1, max_size=20),
     data=st.data(),
 )
-def test_kernel_agrees_with_plain_autograd(
+def test_kernel_and_pytorch_agree_with_stepwise_autograd(
     config: NetworkConfig, lengths: list[int], data: st.DataObject
 ) -> None:
     network = network_of(config)
@@ -121,21 +131,17 @@ def test_kernel_agrees_with_plain_autograd(
     chosen = torch.tensor(order[: data.draw(st.integers(1, len(order)))])
     units = sum(level.units for level in network.levels())
     initial = torch.randn(len(chosen), units, dtype=DOUBLE)
-    expected = loss_and_gradients(plain_divergence, network, sequences, chosen, initial)
+    expected = loss_and_gradients(stepwise_divergence, network, sequences, chosen, initial)
 
     assert_alike(
-        loss_and_gradients(cpu.divergence, network, sequences, chosen, initial), expected, 1e-10
+        loss_and_gradients(divergence, network, sequences, chosen, initial), expected, 1e-10
     )
     assert_alike(
         loss_and_gradients(reference_divergence, network, sequences, chosen, initial),
         expected,
         1e-10,
     )
-    single = VMDNN(config)
-    single.load_state_dict(network.state_dict())
-    results = loss_and_gradients(
-        cpu.divergence, single, as_type(sequences, torch.float32), chosen, initial.float()
-    )
+    results = in_single_precision(network, sequences, chosen, initial)
     assert_alike(results, expected, 1e-4)
 
 
@@ -147,12 +153,8 @@ def test_paper_network_in_single_precision(order: str) -> None:
     network = network_of(config, limit=0.1)
     sequences = sequences_for(network, [70, 130, 101, 130, 125])
     chosen, initial = torch.arange(5), torch.zeros(5, 100, dtype=DOUBLE)
-    expected = loss_and_gradients(plain_divergence, network, sequences, chosen, initial)
-    single = VMDNN(config)
-    single.load_state_dict(network.state_dict())
-    results = loss_and_gradients(
-        cpu.divergence, single, as_type(sequences, torch.float32), chosen, initial.float()
-    )
+    expected = loss_and_gradients(stepwise_divergence, network, sequences, chosen, initial)
+    results = in_single_precision(network, sequences, chosen, initial)
     assert_alike(results, expected, 1e-5)
 
 
@@ -165,12 +167,13 @@ def test_gradients_are_added_as_backward_adds_them(order: str, shifted: bool) ->
     shift = torch.randn(18, sequences.seen.shape[2], dtype=DOUBLE) if shifted else None
     parameters = network.core_parameters()
     for _ in range(2):
-        loss = plain_divergence(network, sequences, chosen, None, shift)
+        loss = stepwise_divergence(network, Minibatch(sequences, chosen, shift=shift))
         loss.backward()
     expected = [parameter.grad for parameter in parameters]
     network.zero_grad()
+    minibatch = Minibatch(sequences, chosen, shift=shift)
     for _ in range(2):
-        assert add_gradients(network, sequences, chosen, shift) == pytest.approx(loss.item())
+        assert add_gradients(network, minibatch) == pytest.approx(loss.item())
     assert_alike([p.grad for p in parameters], expected, 1e-10)
 
 
@@ -180,49 +183,15 @@ def test_small_activity_keeps_its_digits() -> None:
     network = network_of(NetworkConfig(), limit=1e-3)
     sequences = sequences_for(network, [50] * 3)
     chosen, initial = torch.arange(3), torch.zeros(3, 100, dtype=DOUBLE)
-    expected = loss_and_gradients(plain_divergence, network, sequences, chosen, initial)
-    single = VMDNN(NetworkConfig())
-    single.load_state_dict(network.state_dict())
-    results = loss_and_gradients(
-        cpu.divergence, single, as_type(sequences, torch.float32), chosen, initial.float()
-    )
+    expected = loss_and_gradients(stepwise_divergence, network, sequences, chosen, initial)
+    results = in_single_precision(network, sequences, chosen, initial)
     assert_alike(results, expected, 1e-5)
-
-
-@pytest.mark.usefixtures("_compiled")
-def test_same_numbers_for_any_number_of_threads() -> None:
-    network = VMDNN(NetworkConfig())
-    network.load_state_dict(network_of(NetworkConfig()).state_dict())
-    sequences = as_type(sequences_for(network, [60] * 50), torch.float32)
-    chosen, initial = torch.arange(50), torch.zeros(50, 100)
-    before = torch.get_num_threads()
-    try:
-        results = []
-        for threads in (1, 2, 5):
-            torch.set_num_threads(threads)
-            results.append(loss_and_gradients(cpu.divergence, network, sequences, chosen, initial))
-    finally:
-        torch.set_num_threads(before)
-    for result in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(result, results[0], strict=True))
-
-
-@pytest.mark.usefixtures("_compiled")
-def test_what_fills_up_a_sequence_does_not_count() -> None:
-    network = network_of(NetworkConfig())
-    sequences = sequences_for(network, [9, 30])
-    chosen, initial = torch.arange(2), torch.zeros(2, 100, dtype=DOUBLE)
-    expected = loss_and_gradients(cpu.divergence, network, sequences, chosen, initial)
-    sequences.seen[0, 9:] = 7
-    sequences.codes[0, 9:] = 0.1
-    results = loss_and_gradients(cpu.divergence, network, sequences, chosen, initial)
-    assert all(torch.equal(a, b) for a, b in zip(results, expected, strict=True))
 
 
 @pytest.mark.usefixtures("_compiled")
 def test_second_derivatives_are_refused() -> None:
     network = network_of(NetworkConfig())
-    loss = divergence(network, sequences_for(network, [4]), torch.tensor([0]))
+    loss = divergence(network, Minibatch.of_all(sequences_for(network, [4])))
     with pytest.raises(RuntimeError, match="first derivatives only"):
         torch.autograd.grad(loss, network.core_parameters(), create_graph=True)
 
@@ -230,21 +199,11 @@ def test_second_derivatives_are_refused() -> None:
 @pytest.mark.usefixtures("_compiled")
 def test_without_gradients_the_same_loss() -> None:
     network = network_of(NetworkConfig())
-    sequences, chosen = sequences_for(network, [20, 7]), torch.tensor([1, 0])
+    minibatch = Minibatch(sequences_for(network, [20, 7]), torch.tensor([1, 0]))
     with torch.no_grad():
-        value = divergence(network, sequences, chosen)
+        value = divergence(network, minibatch)
     assert not value.requires_grad
-    assert value == divergence(network, sequences, chosen)
-
-
-@pytest.mark.usefixtures("_compiled")
-@pytest.mark.parametrize("chosen", [[-1], [2], []])
-def test_indices_outside_are_refused(chosen: list[int]) -> None:
-    network = network_of(NetworkConfig())
-    with pytest.raises((IndexError, ValueError), match="chosen"):
-        cpu.divergence(
-            network, sequences_for(network, [3, 4]), torch.tensor(chosen, dtype=torch.int64)
-        )
+    assert value == divergence(network, minibatch)
 
 
 @pytest.mark.usefixtures("_compiled")
@@ -252,7 +211,7 @@ def test_sequences_of_another_network_are_refused() -> None:
     network = network_of(NetworkConfig())
     other = network_of(NetworkConfig(softmax_units=7))
     with pytest.raises(ValueError, match="codes"):
-        cpu.divergence(network, sequences_for(other, [3]), torch.tensor([0]))
+        divergence(network, Minibatch.of_all(sequences_for(other, [3])))
 
 
 def test_without_a_compiler_pytorch_computes_it(
@@ -262,16 +221,14 @@ def test_without_a_compiler_pytorch_computes_it(
     monkeypatch.delenv("CXX", raising=False)
     monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
     monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
-    cpu._functions.cache_clear()
     learning_library.cache_clear()
     try:
         network = network_of(NetworkConfig())
-        sequences, chosen = sequences_for(network, [5]), torch.tensor([0])
-        assert not cpu.serves(sequences)
-        expected = reference_divergence(network, sequences, chosen)
-        assert torch.equal(divergence(network, sequences, chosen), expected)
-        assert add_gradients(network, sequences, chosen) == expected
+        minibatch = Minibatch.of_all(sequences_for(network, [5]))
+        assert not core.supports(minibatch.sequences.seen)
+        expected = reference_divergence(network, minibatch)
+        assert torch.equal(divergence(network, minibatch), expected)
+        assert add_gradients(network, minibatch) == expected
     finally:
-        cpu._functions.cache_clear()
         learning_library.cache_clear()
     assert len([line for line in caplog.messages if "no C++ compiler" in line]) == 1

@@ -1,105 +1,149 @@
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import product
 
-import numpy as np
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from learner.kernels import mixing
-from learner.network.softmax_code import SoftmaxCode
-from learner.training.interpolation import REACH, Cells, Mixtures, mixed
-from learner.training.sequences import Sequences
-from proto.body import ACTION_SIZE
-from proto.config import NetworkConfig
+from learner.training.interpolation import OVERSHOOT, Mixtures, NeighbourGrid
 
-PLACES, YAWS = (0.2, 0.25, 0.3), (-45.0, 0.0, 45.0)
-GRID = [{"yaw": yaw, "y": y} for y, yaw in product(PLACES, YAWS)]
+Y_M, YAWS = (0.2, 0.25, 0.3), (-45.0, 0.0, 45.0)
+GRID = [{"yaw": yaw, "y": y} for y, yaw in product(Y_M, YAWS)]
 
 
-def drawn(cells: Cells, index: int, share: float = 1.0, draws: int = 400) -> Mixtures:
+def drawn(grid: NeighbourGrid, index: int, share: float = 1.0, draws: int = 400) -> Mixtures:
     generator = torch.Generator().manual_seed(1)
-    return cells.mixtures(torch.full((draws,), index), share, generator)
+    return grid.mixtures(torch.full((draws,), index), share, generator)
 
 
-def corners(cells: Cells, index: int) -> set[tuple[int, ...]]:
-    return {tuple(sorted(members)) for members in drawn(cells, index).members.tolist()}
+def corners(grid: NeighbourGrid, index: int) -> set[tuple[int, ...]]:
+    return {tuple(sorted(members)) for members in drawn(grid, index).members.tolist()}
 
 
 def test_a_sequence_is_mixed_with_those_at_the_corners_of_a_cell_around_it() -> None:
-    cells = Cells(GRID, [10] * 9)
-    assert corners(cells, 0) == {(0, 1, 3, 4)}
-    assert corners(cells, 1) == {(0, 1, 3, 4), (1, 2, 4, 5)}
-    assert corners(cells, 4) == {(0, 1, 3, 4), (1, 2, 4, 5), (3, 4, 6, 7), (4, 5, 7, 8)}
+    grid = NeighbourGrid(GRID, [10] * 9)
+    assert corners(grid, 0) == {(0, 1, 3, 4)}
+    assert corners(grid, 1) == {(0, 1, 3, 4), (1, 2, 4, 5)}
+    assert corners(grid, 4) == {(0, 1, 3, 4), (1, 2, 4, 5), (3, 4, 6, 7), (4, 5, 7, 8)}
 
 
 @given(seed=st.integers(0, 2**31), index=st.integers(0, 8))
 def test_a_mixture_lies_where_its_weights_say(seed: int, index: int) -> None:
     generator = torch.Generator().manual_seed(seed)
-    cells = Cells(GRID, [10] * 9)
-    mixtures = cells.mixtures(torch.full((50,), index), 1.0, generator)
+    grid = NeighbourGrid(GRID, [10] * 9)
+    mixtures = grid.mixtures(torch.full((50,), index), 1.0, generator)
     assert torch.allclose(mixtures.weights.sum(1), torch.ones(50))
     assert (mixtures.members[:, 0] == index).all()
     places = torch.tensor([[one["y"], one["yaw"]] for one in GRID])
     where = mixtures.of(places)
     near = (where - places[index]).abs()
-    assert (near <= (1 + REACH) * torch.tensor([0.0501, 45.01])).all()
+    assert (near <= (1 + OVERSHOOT) * torch.tensor([0.0501, 45.01])).all()
     assert len({tuple(one) for one in where.tolist()}) > 40
 
 
 def test_every_repeat_of_a_corner_is_drawn() -> None:
-    cells = Cells([GRID[0], GRID[1], GRID[1], GRID[1]], [10] * 4)
-    assert set(drawn(cells, 0).members.flatten().tolist()) == {0, 1, 2, 3}
+    grid = NeighbourGrid([GRID[0], GRID[1], GRID[1], GRID[1]], [10] * 4)
+    assert set(drawn(grid, 0).members.flatten().tolist()) == {0, 1, 2, 3}
 
 
 def test_a_situation_off_the_grid_stays_as_it_is() -> None:
-    cells = Cells([*GRID, {"y": 0.22, "yaw": 10.0}], [10] * 10)
-    assert drawn(cells, 9).members.eq(9).all()
-    assert corners(cells, 0) == {(0, 1, 3, 4)}
+    grid = NeighbourGrid([*GRID, {"y": 0.22, "yaw": 10.0}], [10] * 10)
+    assert drawn(grid, 9).members.eq(9).all()
+    assert corners(grid, 0) == {(0, 1, 3, 4)}
 
 
 def test_where_a_corner_is_missing_the_cell_is_flat() -> None:
-    cells = Cells(GRID[:5], [10] * 5)  # the lower row and two of the middle one
-    assert corners(cells, 0) == {(0, 1, 3, 4)}
-    assert (2, 2, 2, 2) not in corners(cells, 2)
-    assert all(set(members) <= {1, 2, 4} for members in corners(cells, 2))
+    grid = NeighbourGrid(GRID[:5], [10] * 5)  # the lower row and two of the middle one
+    assert corners(grid, 0) == {(0, 1, 3, 4)}
+    assert (2, 2, 2, 2) not in corners(grid, 2)
+    assert all(set(members) <= {1, 2, 4} for members in corners(grid, 2))
 
 
 def test_sequences_of_different_lengths_are_not_mixed() -> None:
-    cells = Cells(GRID[:3], [10, 11, 10])
-    assert set(drawn(cells, 0).members.flatten().tolist()) == {0, 2}
-    assert set(drawn(cells, 1).members.flatten().tolist()) == {1}
+    grid = NeighbourGrid(GRID[:3], [10, 11, 10])
+    assert set(drawn(grid, 0).members.flatten().tolist()) == {0, 2}
+    assert set(drawn(grid, 1).members.flatten().tolist()) == {1}
 
 
 def test_a_share_is_mixed_and_the_rest_stays() -> None:
-    mixtures = drawn(Cells(GRID, [10] * 9), 4, share=0.3, draws=2000)
+    mixtures = drawn(NeighbourGrid(GRID, [10] * 9), 4, share=0.3, draws=2000)
     kept = mixtures.weights[:, 0] == 1
     assert abs(kept.float().mean() - 0.7) < 0.05
 
 
-@pytest.mark.parametrize("kind", [torch.float32, torch.float64])
-def test_the_kernel_mixes_as_numpy_does(kind: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
-    generator = torch.Generator().manual_seed(2)
-    ranges = (
-        -torch.rand(ACTION_SIZE, generator=generator),
-        torch.rand(ACTION_SIZE, generator=generator),
-    )
-    code = SoftmaxCode.of_ranges(*(each.numpy() for each in ranges), NetworkConfig())
-    seen = torch.randn(5, 7, 21, generator=generator, dtype=kind)
-    targets = torch.randn(5, 7, ACTION_SIZE, generator=generator, dtype=kind)  # some out of range
-    codes = torch.from_numpy(code.encode(targets.numpy())).to(kind)
-    sequences = Sequences.of(seen, codes, torch.ones(5, 7, dtype=kind))
-    mixtures = Mixtures(
-        torch.randint(5, (6, 4), generator=generator),
-        torch.rand(6, 4, generator=generator, dtype=kind).softmax(1),
-    )
-    if not mixing.serves(sequences):
-        pytest.skip("the kernels are not compiled here")
-    compiled = mixed(mixtures, sequences, targets, code)
-    monkeypatch.setattr(mixing, "serves", lambda _: False)
-    reference = mixed(mixtures, sequences, targets, code)
-    for name, tensor in vars(reference).items():
-        assert getattr(compiled, name).dtype == kind
-        np.testing.assert_allclose(getattr(compiled, name), tensor, rtol=2e-5, atol=2e-6)
+# --- discrete values ---
+
+SHAPES = st.sampled_from(["box", "ball", "cup"])
+SITUATIONS = st.lists(
+    st.fixed_dictionaries(
+        {
+            "object": SHAPES,
+            "gesture": st.sampled_from(["wave", "point"]),
+            "y": st.sampled_from(Y_M),
+            "yaw": st.sampled_from(YAWS),
+        }
+    ),
+    min_size=1,
+    max_size=40,
+)
+
+
+def discrete(situation: Mapping[str, float | str]) -> tuple[str | float, ...]:
+    return tuple(value for _, value in sorted(situation.items()) if isinstance(value, str))
+
+
+@given(situations=SITUATIONS, data=st.data(), seed=st.integers(0, 2**31))
+def test_only_sequences_with_the_same_discrete_values_and_length_are_mixed(
+    situations: list[dict[str, float | str]], data: st.DataObject, seed: int
+) -> None:
+    count = len(situations)
+    steps = data.draw(st.lists(st.sampled_from([10, 11]), min_size=count, max_size=count))
+    grid = NeighbourGrid(situations, steps)
+    generator = torch.Generator().manual_seed(seed)
+    mixtures = grid.mixtures(torch.arange(count), 1.0, generator)
+    assert mixtures.members.shape == (count, 4), "corners along the two continuous values"
+    for index, members in enumerate(mixtures.members.tolist()):
+        assert members[0] == index
+        for member in members:
+            assert discrete(situations[member]) == discrete(situations[index])
+            assert steps[member] == steps[index]
+
+
+@given(situations=SITUATIONS, seed=st.integers(0, 2**31))
+def test_a_discrete_value_divides_the_grid_into_independent_ones(
+    situations: list[dict[str, float | str]], seed: int
+) -> None:
+    """The mixtures of a group are those of a grid of its sequences alone."""
+    whole = NeighbourGrid(situations, [10] * len(situations))
+    group = [
+        index
+        for index, situation in enumerate(situations)
+        if discrete(situation) == discrete(situations[0])
+    ]
+    alone = NeighbourGrid([situations[index] for index in group], [10] * len(group))
+    in_whole = whole.mixtures(torch.tensor(group), 1.0, torch.Generator().manual_seed(seed))
+    by_itself = alone.mixtures(torch.arange(len(group)), 1.0, torch.Generator().manual_seed(seed))
+    assert torch.equal(in_whole.members, torch.tensor(group)[by_itself.members])
+    assert torch.equal(in_whole.weights, by_itself.weights)
+
+
+@given(seed=st.integers(0, 2**31))
+def test_a_discrete_value_that_is_the_same_everywhere_changes_no_draw(seed: int) -> None:
+    named = [{**situation, "object": "box"} for situation in GRID]
+    mixtures = [
+        NeighbourGrid(situations, [10] * 9).mixtures(
+            torch.arange(9), 0.7, torch.Generator().manual_seed(seed)
+        )
+        for situations in (GRID, named)
+    ]
+    assert torch.equal(mixtures[0].members, mixtures[1].members)
+    assert torch.equal(mixtures[0].weights, mixtures[1].weights)
+
+
+def test_without_continuous_values_nothing_is_mixed() -> None:
+    grid = NeighbourGrid([{"object": "box"}, {"object": "ball"}, {"object": "box"}], [10] * 3)
+    mixtures = grid.mixtures(torch.arange(3), 1.0, torch.Generator().manual_seed(1))
+    assert mixtures.members.tolist() == [[0], [1], [2]]
+    assert mixtures.weights.tolist() == [[1.0], [1.0], [1.0]]

@@ -10,16 +10,21 @@ import torch
 
 from learner.checkpoint import checkpoint_from_bytes
 from learner.network_policy import NetworkPolicy
+from learner.training.coupled import CoupledTraining
 from learner.training.trainer import Trainer
 from learner.training.training_run import policy_is_due
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.store import TutoringStore
 from proto.body import ACTION_VALUES, ARM
 from proto.config import Config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.metrics import Stage
+from proto.variables import Question
 
-UNDISTURBED = {"vision_noise": 0.0, "interpolation": 0.0}
+QUESTIONS = (Question("object_y_m", 3), Question("object_yaw_deg", 5))
+
+WITHOUT_NOISE = {"vision_noise": 0.0, "interpolation": 0.0}
 RANGES = np.array([value.maximum - value.minimum for value in ACTION_VALUES])
 
 MakeConfig = Callable[..., Config]
@@ -39,20 +44,24 @@ def train(trainer: Trainer, epochs: int) -> list[float]:
 
 
 def same_network(one: Trainer, other: Trainer) -> bool:
-    there = other.network.state_dict()
+    there = other.recipe.network.state_dict()
     return all(
-        torch.equal(tensor, there[name]) for name, tensor in one.network.state_dict().items()
+        torch.equal(tensor, there[name]) for name, tensor in one.recipe.network.state_dict().items()
     )
 
 
 def test_it_learns_to_tell_situations_apart(
     store: TutoringStore, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:
-    trainer = Trainer(small_config(pretraining=60, epochs=300, batch=60, **UNDISTURBED), store)
+    trainer = Trainer(
+        VMDNNRecipe(small_config(pretraining=60, epochs=300, batch=60, **WITHOUT_NOISE), QUESTIONS),
+        store,
+    )
     train(trainer, 60)
     first, *_, last = train(trainer, 300)
     assert last < 0.15 * first
-    assert trainer.mean_errors()[ARM].mean() < 4
+    assert isinstance(trainer.objective, CoupledTraining)
+    assert trainer.objective.mean_errors()[ARM].mean() < 4
 
     policy = NetworkPolicy.from_bytes(trainer.policy_bytes(1))
     for episode in bar_episodes():
@@ -64,7 +73,7 @@ def test_it_learns_to_tell_situations_apart(
 
 
 def test_stages_follow_each_other(store: TutoringStore, small_config: MakeConfig) -> None:
-    trainer = Trainer(small_config(pretraining=2, epochs=3), store)
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=2, epochs=3), QUESTIONS), store)
     seen = []
     while not trainer.finished:
         trainer.epoch()
@@ -81,12 +90,12 @@ def test_stages_follow_each_other(store: TutoringStore, small_config: MakeConfig
 def test_coupled_training_leaves_the_vision_alone(
     store: TutoringStore, small_config: MakeConfig
 ) -> None:
-    trainer = Trainer(small_config(pretraining=1, epochs=3), store)
-    at_first = {n: p.clone() for n, p in trainer.network.named_parameters()}
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=1, epochs=3), QUESTIONS), store)
+    at_first = {n: p.clone() for n, p in trainer.recipe.network.named_parameters()}
     trainer.epoch()
-    formed = {n: p.clone() for n, p in trainer.network.named_parameters()}
+    formed = {n: p.clone() for n, p in trainer.recipe.network.named_parameters()}
     train(trainer, 3)
-    for name, parameter in trainer.network.named_parameters():
+    for name, parameter in trainer.recipe.network.named_parameters():
         vision = name.startswith("mstnn")
         assert torch.equal(parameter, formed[name]) == vision, name
         assert torch.equal(at_first[name], formed[name]) != (vision or name.startswith("pfc.")) or (
@@ -97,7 +106,9 @@ def test_coupled_training_leaves_the_vision_alone(
 def test_same_seed_same_network(store: TutoringStore, small_config: MakeConfig) -> None:
     config = small_config()
     other_seed = config.model_copy(update={"run": config.run.model_copy(update={"seed": 2})})
-    trainers = [Trainer(given, store) for given in (config, config, other_seed)]
+    trainers = [
+        Trainer(VMDNNRecipe(given, QUESTIONS), store) for given in (config, config, other_seed)
+    ]
     for trainer in trainers:
         train(trainer, 10)
     assert same_network(trainers[0], trainers[1])
@@ -109,22 +120,22 @@ def test_resumed_training_is_bit_identical(
     store: TutoringStore, small_config: MakeConfig, tmp_path: Path, interruptions: list[int]
 ) -> None:
     config = small_config(pretraining=4, epochs=6)
-    whole = Trainer(config, store)
+    whole = Trainer(VMDNNRecipe(config, QUESTIONS), store)
     losses = train(whole, 10)
 
     path = tmp_path / "training.safetensors"
-    trainer, resumed = Trainer(config, store), []
+    trainer, resumed = Trainer(VMDNNRecipe(config, QUESTIONS), store), []
     for end in [*interruptions, 10]:
         resumed += train(trainer, end - len(resumed))
         trainer.save(path)
-        trainer = Trainer.restore(path, config, TutoringStore(store.folder))
+        trainer = Trainer.restore(path, VMDNNRecipe(config, QUESTIONS), TutoringStore(store.folder))
     assert resumed == losses
     assert trainer.finished
     assert same_network(trainer, whole)
     assert trainer.policy_bytes(1) == whole.policy_bytes(1)
 
 
-def train_in_laps(
+def train_in_rounds(
     trainer: Trainer, store: TutoringStore, episodes: Sequence[Episode], end: int
 ) -> list[float]:
     """Train to an epoch; a correction comes in before each round."""
@@ -140,7 +151,7 @@ def train_in_laps(
 
 
 @pytest.mark.parametrize("interrupted_at", [2, 3, 4, 5, 6, 7])
-def test_each_round_is_a_lap_and_can_be_resumed_anywhere(
+def test_training_can_be_resumed_anywhere_in_any_round(
     tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes, interrupted_at: int
 ) -> None:
     config = small_config(pretraining=0, epochs=3, corrections={"epochs": 2})
@@ -148,51 +159,53 @@ def test_each_round_is_a_lap_and_can_be_resumed_anywhere(
     for store in stores:
         for episode in bar_episodes():
             store.add(episode)
-    whole = Trainer(config, stores[0], rounds=2)
-    losses = train_in_laps(whole, stores[0], bar_episodes(), 7)
+    whole = Trainer(VMDNNRecipe(config, QUESTIONS), stores[0], rounds=2)
+    losses = train_in_rounds(whole, stores[0], bar_episodes(), 7)
     assert whole.finished
     assert (whole.epochs_total, whole.sequences) == (7, 6)
 
-    trainer = Trainer(config, stores[1], rounds=2)
-    before = train_in_laps(trainer, stores[1], bar_episodes(), interrupted_at)
+    trainer = Trainer(VMDNNRecipe(config, QUESTIONS), stores[1], rounds=2)
+    before = train_in_rounds(trainer, stores[1], bar_episodes(), interrupted_at)
     path = tmp_path / "training.safetensors"
     trainer.save(path)
     again = TutoringStore(stores[1].folder)
-    resumed = Trainer.restore(path, config, again, rounds=2)
+    resumed = Trainer.restore(path, VMDNNRecipe(config, QUESTIONS), again, rounds=2)
     assert (resumed.round, resumed.round_begins) == (trainer.round, trainer.round_begins)
-    assert before + train_in_laps(resumed, again, bar_episodes(), 7) == losses
+    assert before + train_in_rounds(resumed, again, bar_episodes(), 7) == losses
     assert resumed.finished
     assert resumed.policy_bytes(1) == whole.policy_bytes(1)
 
 
-def test_each_lap_has_a_schedule_of_its_own(store: TutoringStore, small_config: MakeConfig) -> None:
+def test_each_round_has_a_schedule_of_its_own(
+    store: TutoringStore, small_config: MakeConfig
+) -> None:
     config = small_config(pretraining=0, epochs=20, corrections={"epochs": 20})
-    trainer = Trainer(config, store, rounds=1)
+    trainer = Trainer(VMDNNRecipe(config, QUESTIONS), store, rounds=1)
 
     def step() -> float:
-        before = trainer.network.outputs.bias.detach().clone()
+        before = trainer.recipe.network.outputs.bias.detach().clone()
         trainer.epoch()
-        return float((trainer.network.outputs.bias.detach() - before).abs().max())
+        return float((trainer.recipe.network.outputs.bias.detach() - before).abs().max())
 
     steps = [step() for _ in range(40)]
     assert trainer.finished
     for first in (0, 20):  # it rises to the third epoch, and falls to the last
-        lap = steps[first : first + 20]
-        assert lap[19] < 0.1 * lap[2]
+        round_steps = steps[first : first + 20]
+        assert round_steps[19] < 0.1 * round_steps[2]
 
 
-def test_policies_of_each_lap_know_what_they_learned_from(
+def test_policies_of_each_round_know_what_they_learned_from(
     store: TutoringStore, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:
     config = small_config(
         pretraining=2, epochs=6, publish_every_epochs=4, corrections={"epochs": 5}
     )
     store.add(replace(bar_episodes()[0], id="the-same-case-again"))
-    trainer = Trainer(config, store, rounds=2)
+    trainer = Trainer(VMDNNRecipe(config, QUESTIONS), store, rounds=2)
     due = []
     while not trainer.finished:
-        train_in_laps(trainer, store, bar_episodes(), trainer.epochs_done + 1)
-        if policy_is_due(trainer, config.learner):
+        train_in_rounds(trainer, store, bar_episodes(), trainer.epochs_done + 1)
+        if policy_is_due(trainer):
             due.append(checkpoint_from_bytes(trainer.policy_bytes(len(due) + 1), "").metadata)
     assert [(policy.epoch, policy.cases, policy.sequences) for policy in due] == [
         (4, 4, 5),
@@ -201,8 +214,10 @@ def test_policies_of_each_lap_know_what_they_learned_from(
         (16, 6, 7),
     ]
     # without actors there are no corrections, whatever the config says
-    assert Trainer(config, store).epochs_total == 2
-    offline = Trainer(small_config(pretraining=0, corrections={"rounds": 3}), store)
+    assert Trainer(VMDNNRecipe(config, QUESTIONS), store).epochs_total == 2
+    offline = Trainer(
+        VMDNNRecipe(small_config(pretraining=0, corrections={"rounds": 3}), QUESTIONS), store
+    )
     assert offline.epochs_total == 6
 
 
@@ -212,7 +227,7 @@ def test_sequences_may_come_while_training_goes_on(
     config = small_config(pretraining=3, epochs=6)
     episodes = bar_episodes()
     store = TutoringStore(tmp_path / "tutoring")
-    trainer = Trainer(config, store)
+    trainer = Trainer(VMDNNRecipe(config, QUESTIONS), store)
     with pytest.raises(UserError, match=r"holds no tutored sequence .*`vmdnn tutor`"):
         trainer.epoch()
     counts = []
@@ -232,7 +247,7 @@ def test_sequences_may_come_while_training_goes_on(
     # the order in which they came counts, and survives
     path = tmp_path / "training.safetensors"
     trainer.save(path)
-    resumed = Trainer.restore(path, config, TutoringStore(store.folder))
+    resumed = Trainer.restore(path, VMDNNRecipe(config, QUESTIONS), TutoringStore(store.folder))
     assert train(resumed, 3) == train(trainer, 3)
     assert same_network(resumed, trainer)
 
@@ -246,7 +261,7 @@ def test_ranges_of_the_code_stay_as_they_were_when_coupled_training_began(
     store = TutoringStore(tmp_path / "tutoring")
     near, far = bar_episodes(places=(0.5, 1.0), slopes=(0.5,))
     store.add(near)
-    trainer = Trainer(small_config(pretraining=0), store)
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=0), QUESTIONS), store)
     trainer.epoch()
     before = trainer.policy_bytes(1)
     store.add(far)
@@ -264,7 +279,7 @@ def test_pretraining_may_have_sequences_of_its_own(
     others = TutoringStore(tmp_path / "others")
     for episode in bar_episodes(places=(0.0, 0.5, 1.0), steps=12):
         others.add(episode)
-    trainer = Trainer(small_config(pretraining=2), store, others)
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=2), QUESTIONS), store, others)
     trainer.epoch()
     assert trainer.sequences == 6
     train(trainer, 2)
@@ -274,7 +289,11 @@ def test_pretraining_may_have_sequences_of_its_own(
 def test_pretraining_waits_for_sequences_of_its_own(
     store: TutoringStore, tmp_path: Path, small_config: MakeConfig
 ) -> None:
-    trainer = Trainer(small_config(pretraining=1), store, TutoringStore(tmp_path / "others"))
+    trainer = Trainer(
+        VMDNNRecipe(small_config(pretraining=1), QUESTIONS),
+        store,
+        TutoringStore(tmp_path / "others"),
+    )
     assert trainer.next_stage is Stage.PRETRAINING
     with pytest.raises(UserError, match="others holds no tutored sequence"):
         trainer.epoch()
@@ -288,7 +307,7 @@ def test_sequences_of_different_lengths(
     *_, long = bar_episodes(steps=25)
     store.add(short)
     store.add(long)
-    trainer = Trainer(small_config(), store)
+    trainer = Trainer(VMDNNRecipe(small_config(), QUESTIONS), store)
     assert np.isfinite(train(trainer, 10)).all()
 
 
@@ -299,12 +318,12 @@ def test_what_cannot_be_learned_from_is_refused(
     broken = episode.targets.copy()
     broken[3, 4] = np.nan
     store.add(replace(episode, id="trial", kind=Kind.TRIAL))
-    store.add(replace(episode, id="other-task", situation={"side": 1.0}))
+    store.add(replace(episode, id="other-task", task="reaching"))
     store.add(replace(episode, id="broken", targets=broken))
-    trainer = Trainer(small_config(pretraining=1), store)
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=1), QUESTIONS), store)
     trainer.epoch()
     trainer.epoch()
-    assert trainer.sequences == 5  # coupled training asks for no label
+    assert trainer.sequences == 4
 
 
 def test_none_can_be_learned_from(
@@ -313,7 +332,7 @@ def test_none_can_be_learned_from(
     store = TutoringStore(tmp_path)
     store.add(replace(bar_episodes()[0], situation={"side": 1.0}))
     with pytest.raises(UserError, match=r"has no 'object_y_m' in its situation") as caught:
-        Trainer(small_config(), store).epoch()
+        Trainer(VMDNNRecipe(small_config(), QUESTIONS), store).epoch()
     assert "none of the 1 sequences" in str(caught.value)
 
 
@@ -321,31 +340,33 @@ def test_checkpoint_of_another_network_is_refused(
     store: TutoringStore, small_config: MakeConfig, tmp_path: Path
 ) -> None:
     path = tmp_path / "training.safetensors"
-    Trainer(small_config(), store).save(path)
+    Trainer(VMDNNRecipe(small_config(), QUESTIONS), store).save(path)
     with pytest.raises(UserError, match=r"network.pfc.units: 8 in the checkpoint, 20 in"):
-        Trainer.restore(path, Config(), store)
+        Trainer.restore(path, VMDNNRecipe(Config(), QUESTIONS), store)
 
 
 def test_training_cannot_go_on_from_a_policy(
     store: TutoringStore, small_config: MakeConfig, tmp_path: Path
 ) -> None:
     config = small_config(pretraining=0)
-    trainer = Trainer(config, store)
+    trainer = Trainer(VMDNNRecipe(config, QUESTIONS), store)
     trainer.epoch()
     path = tmp_path / "policy.safetensors"
     path.write_bytes(trainer.policy_bytes(1))
     with pytest.raises(UserError, match=r"is a policy: it can act, but"):
-        Trainer.restore(path, config, store)
+        Trainer.restore(path, VMDNNRecipe(config, QUESTIONS), store)
 
 
 def test_more_epochs_prolong_a_finished_training(
     store: TutoringStore, small_config: MakeConfig, tmp_path: Path
 ) -> None:
-    trainer = Trainer(small_config(pretraining=1, epochs=2), store)
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=1, epochs=2), QUESTIONS), store)
     train(trainer, 3)
     path = tmp_path / "training.safetensors"
     trainer.save(path)
-    longer = Trainer.restore(path, small_config(pretraining=1, epochs=4), store)
+    longer = Trainer.restore(
+        path, VMDNNRecipe(small_config(pretraining=1, epochs=4), QUESTIONS), store
+    )
     assert (longer.stage, longer.epochs_done, longer.epochs_total) == (Stage.COUPLED, 2, 4)
     train(longer, 2)
     assert longer.finished
@@ -354,10 +375,10 @@ def test_more_epochs_prolong_a_finished_training(
 def test_divergence_is_said_and_stops_the_training(
     store: TutoringStore, small_config: MakeConfig
 ) -> None:
-    trainer = Trainer(small_config(pretraining=0), store)
+    trainer = Trainer(VMDNNRecipe(small_config(pretraining=0), QUESTIONS), store)
     trainer.epoch()
     with torch.no_grad():
-        trainer.network.outputs.bias[0] = torch.inf
+        trainer.recipe.network.outputs.bias[0] = torch.inf
     with pytest.raises(UserError, match=r"diverged .*: lower learner.rate"):
         trainer.epoch()
     assert trainer.epochs_done == 1

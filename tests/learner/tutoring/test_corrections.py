@@ -7,20 +7,19 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from outcomes import IMPRECISE, PRECISE
 
-from actors.tasks.experiment1.task import Experiment1
+from actors.tasks.registry import make_task
 from learner.tutoring.corrections import Round
 from learner.tutoring.failures import TRIES
-from proto.config import Config
-from proto.episode import Episode, Kind, Outcome, Reason
+from proto.config import Config, TaskConfig
+from proto.episode import Episode, Kind, Outcome
 from proto.messages import Correction, EpisodeFailed, TutoringRequest, Verdict
 from proto.seeds import CORRECTIONS
 
 MakeEpisode = Callable[..., Episode]
-TASK = Experiment1()
+TASK = make_task(TaskConfig())
 POLICY = ("training", 7)
-PRECISE = Outcome(True, True, True, Reason.NONE, 0.1, 1, 2, 3, 4, 5, 80, -1)
-IMPRECISE = Outcome(True, True, False, Reason.IMPRECISE, 0.1, 1, 2, 11, 4, 5, 80, -1)
 
 
 def make_round(number: int = 1, cases: tuple[int, ...] | None = None, **given: Any) -> Round:

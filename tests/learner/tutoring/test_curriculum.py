@@ -49,7 +49,7 @@ def test_all_cases_unless_some_are_named() -> None:
 
 
 def test_cases_of_pretraining_come_before_all_others(make_episode: MakeEpisode) -> None:
-    first = PretrainingConfig(cases=(0, 14), repeats=2)
+    first = PretrainingConfig(task="reaching", cases=(0, 14), repeats=2)
     config = Config(
         learner=LearnerConfig(cases=(0,), pretraining=first), tutor=TutorConfig(repeats=1)
     )
@@ -130,6 +130,6 @@ def test_a_case_whose_simulation_fails_again_and_again_is_given_up(
 def test_a_case_that_there_is_not_is_named() -> None:
     with pytest.raises(UserError, match=r"no case 45; the task experiment1 has .* 0 to 44"):
         curriculum(cases=(3, 45))
-    first = PretrainingConfig(cases=(15,))
+    first = PretrainingConfig(task="reaching", cases=(15,))
     with pytest.raises(UserError, match=r"learner.pretraining.cases: .* 15; the task reaching"):
         Curriculum(Config(learner=LearnerConfig(pretraining=first)), AVAILABLE)

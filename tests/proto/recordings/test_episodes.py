@@ -18,12 +18,13 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
-from proto.episode import Episode, Kind, Outcome, Reason
+from proto.episode import NO_FAILURE, Episode, Kind, Measure, Outcome
 from proto.errors import UserError
 from proto.recordings.episodes import EpisodeSummary, read_episode, read_summary, write_episode
 from sim_assets.hand import MOTOR_NAMES
 
 OUTPUTS = 110
+FORMAT_1 = Path(__file__).parents[2] / "data" / "format1"
 
 
 MakeEpisode = Callable[..., Episode]
@@ -35,10 +36,13 @@ def floats(*shape: int) -> st.SearchStrategy[np.ndarray]:
 
 @st.composite
 def outcomes(draw: st.DrawFn) -> Outcome:
-    yes_or_no = [draw(st.booleans()) for _ in range(3)]
-    measures = [draw(st.floats()) for _ in range(6)]
-    steps = [draw(st.integers(-1, 200)) for _ in range(2)]
-    return Outcome(*yes_or_no, draw(st.sampled_from(Reason)), *measures, *steps)
+    best = draw(st.integers(0, 3))
+    readings = [level < best for level in range(3)]
+    reason = NO_FAILURE if best == 3 else draw(st.sampled_from(("not_lifted", "imprecise")))
+    measure = st.builds(Measure, st.floats(), st.text(max_size=4))
+    return Outcome(
+        *readings, reason, draw(st.dictionaries(st.text(max_size=8), measure, max_size=4))
+    )
 
 
 @st.composite
@@ -46,11 +50,12 @@ def episodes(draw: st.DrawFn) -> Episode:
     steps = draw(st.integers(0, 4))
     names = draw(st.lists(st.text(max_size=8), max_size=3))
     word = st.text(max_size=12)
+    phases = draw(st.lists(word, min_size=1, max_size=255))
     return Episode(
         id=draw(word),
         kind=draw(st.sampled_from(Kind)),
         task=draw(word),
-        situation=draw(st.dictionaries(word, st.floats(), max_size=3)),
+        situation=draw(st.dictionaries(word, st.floats() | word, max_size=3)),
         seed=draw(st.integers(0, 2**64)),
         actor=draw(word),
         backend=draw(word),
@@ -61,7 +66,8 @@ def episodes(draw: st.DrawFn) -> Episode:
         actions=draw(floats(steps, ACTION_SIZE)),
         targets=draw(floats(steps, ACTION_SIZE)),
         joints_deg=draw(floats(steps, len(JOINT_NAMES))),
-        phases=draw(stn.arrays(np.uint8, (steps,))),
+        phase_names=tuple(phases),
+        phases=draw(stn.arrays(np.uint8, (steps,), elements=st.integers(0, len(phases) - 1))),
         body_names=tuple(names),
         body_poses=draw(floats(steps, len(names), 7)),
         outcome=draw(outcomes()),
@@ -145,11 +151,13 @@ def test_another_mcap_reader_understands_it(tmp_path: Path, make_episode: MakeEp
     assert last_joints.joints[5].position == pytest.approx(np.radians(episode.joints_deg[-1, 5]))
     assert last_step.action.r_elbow == episode.actions[-1, 5]
     assert [frame.child_frame_id for frame in seen["/tf"][0].transforms] == ["object", "obstacle"]
+    assert (last_step.phase, last_step.phase_name) == (8, "lift")
     assert metadata["outcome"]["reason"] == "imprecise"
+    assert metadata["measures"]["yaw_error_deg"] == '[11.0, "deg"]'
     assert metadata["situation"] == {
-        "object_y": "0.25",
-        "object_yaw": "-22.5",
-        "obstacle_x": "-0.27",
+        "obstacle_x_m": "-0.27",
+        "object_y_m": "0.25",
+        "object_yaw_deg": "-22.5",
     }
     assert metadata["episode"]["seed"] == "3001"
     assert metadata["episode"]["config_digest"] == "c0ffee"
@@ -220,3 +228,32 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path, make_episode: Mak
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be written"):
         write_episode(tmp_path / "file" / "episode.mcap", make_episode())
+
+
+def test_a_file_of_format_1_is_read_as_what_it_meant() -> None:
+    episode = read_episode(FORMAT_1 / "episode.mcap")
+    assert (episode.id, episode.kind, episode.policy_version) == ("0123456789abcdef", Kind.TRIAL, 3)
+    assert list(episode.phases) == list(range(8))
+    assert episode.phase_names[:2] == ("phase 1", "phase 2")
+    outcome = episode.outcome
+    assert (outcome.lenient, outcome.strict, outcome.precise) == (True, False, False)
+    assert outcome.reason == "touched_obstacle"
+    assert outcome.measures["moved_mm"] == Measure(1.0, "mm")
+    assert outcome.measures["yaw_error_deg"] == Measure(11.0, "deg")
+    assert outcome.measures["obstacle_touched_at"] == Measure(30.0, "step")
+
+
+def test_a_file_of_a_newer_format_says_so(
+    tmp_path: Path, make_episode: MakeEpisode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "episode.mcap"
+    with monkeypatch.context() as later:
+        later.setattr("proto.recordings.episodes.FORMAT", 3)
+        write_episode(path, make_episode(3))
+    with pytest.raises(UserError, match=r"of format 3, written by a newer vmdnn.*update vmdnn"):
+        read_episode(path)
+
+
+def test_a_step_in_a_phase_without_a_name_is_refused(make_episode: MakeEpisode) -> None:
+    with pytest.raises(ValueError, match="in phase 7 of 3"):
+        make_episode(8, phase_names=("a", "b", "c"))

@@ -27,7 +27,7 @@ CONFIG = {
         "epochs": 6,
         "checkpoint_every_epochs": 4,
         "publish_every_epochs": 2,
-        "pretraining": {"epochs": 2, "labels": {"object_y": 2}},
+        "pretraining": {"epochs": 2},
     },
 }
 
@@ -36,7 +36,17 @@ CONFIG = {
 def data(tmp_path: Path, make_episode: Callable[..., Episode]) -> Path:
     store = TutoringStore(tmp_path / "data")
     for steps in (9, 10, 11):
-        store.add(make_episode(steps, id=f"of-{steps}", situation={"object_y": steps / 40}))
+        store.add(
+            make_episode(
+                steps,
+                id=f"of-{steps}",
+                situation={
+                    "obstacle_x_m": -0.27,
+                    "object_y_m": steps / 40,
+                    "object_yaw_deg": 5.0 * steps,
+                },
+            )
+        )
     return store.folder
 
 
@@ -83,7 +93,7 @@ def test_what_the_vision_tells_can_be_looked_at(
     assert main([*words, str(policy_file(out, 3)), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["sequences"], found["classifier"]) == (3, [])
-    assert {told["value"] for told in found["regression"]} == {"object_y"}
+    assert {told["value"] for told in found["regression"]} == {"object_y_m", "object_yaw_deg"}
 
 
 @pytest.mark.parametrize("pressed_at", [1, 5])

@@ -49,7 +49,7 @@ def test_one_command_draws_two_rollouts_and_says_how_they_differ(
     }
     first = numbers["rollouts"][0]
     assert first["situation"]["object_yaw_deg"] == 44
-    assert [episode.phases[start] for start in first["phase_starts"]] == list(range(1, 9))
+    assert [episode.phases[start] for start in first["phase_starts"]] == list(range(8))
     assert np.shape(first["activity"]["pfc"]) == (episode.steps, 20)
     assert {len(apart) for apart in numbers["difference_by_phase"].values()} == {8}
 

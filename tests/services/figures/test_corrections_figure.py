@@ -1,4 +1,4 @@
-"""The policies at the end of each lap are tested and drawn, each trial played once."""
+"""The policies at the end of each round are tested and drawn, each trial played once."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from typing import Any
 
 import pytest
 
+from actors.tasks.registry import make_pretraining_task
 from learner.checkpoint import policy_file
 from learner.training.trainer import Trainer
 from learner.training.training_run import policy_is_due, write_policy
+from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.store import TutoringStore
 from proto.config import Config
 from proto.episode import Kind
@@ -35,19 +37,19 @@ def run(recordings: Path, tmp_path: Path) -> Path:
     store = TutoringStore(folder / "tutoring")
     shown = store.load(store.ids[0])
     assert shown is not None
-    trainer = Trainer(config, store, rounds=2)
+    trainer = Trainer(VMDNNRecipe(config, make_pretraining_task(config).questions), store, rounds=2)
     while not trainer.finished:
         if trainer.round_begins:
             situation = {**shown.situation, "object_y_m": 0.2 + 0.01 * trainer.round}
             given = {"id": f"corrected-{trainer.round}", "situation": situation}
             store.add(replace(shown, kind=Kind.CORRECTION, **given))  # type: ignore[arg-type]
         trainer.epoch()
-        if policy_is_due(trainer, config.learner):
+        if policy_is_due(trainer):
             write_policy(trainer, folder)
     return folder
 
 
-def test_the_policy_at_the_end_of_each_lap_is_tested_once(
+def test_the_policy_at_the_end_of_each_round_is_tested_once(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "corrections.png"
@@ -63,7 +65,7 @@ def test_the_policy_at_the_end_of_each_lap_is_tested_once(
     ]
     assert policies == [(0, 2, 2, 4, 1), (1, 3, 3, 5, 1), (2, 4, 4, 6, 1)]
 
-    book = run / "evaluation" / "lap_trials.jsonl"
+    book = run / "evaluation" / "round_trials.jsonl"
     first = book.read_bytes()
     assert main([*command.split(), "--trials", "1"]) == 0
     assert json.loads(capsys.readouterr().out) == told
@@ -73,9 +75,9 @@ def test_the_policy_at_the_end_of_each_lap_is_tested_once(
     assert len(book.read_bytes().splitlines()) == 6
 
     # another training of the same name has trials of its own
-    before = open_run(run).lap_ends[0].digest
+    before = open_run(run).policies[0].digest
     shutil.copy(policy_file(run, 3), policy_file(run, 2))
-    assert open_run(run).lap_ends[0].digest != before
+    assert open_run(run).policies[0].digest != before
 
 
 def test_what_cannot_be_drawn_is_named(

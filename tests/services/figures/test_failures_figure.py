@@ -8,14 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from outcomes import measures
 
-from actors.tasks.experiment1.task import GRID, Experiment1
-from proto.episode import Outcome, Reason
+from actors.tasks.experiment1.world import GRID
+from actors.tasks.registry import make_task
+from proto.config import TaskConfig
+from proto.episode import NO_FAILURE, Outcome
 from proto.errors import UserError
 from services.cli import main
-from services.figures.failures import POSITION, YAW, Trials, numbers, snapping
+from services.figures.failures import Trials, numbers, snapping
 from services.trials.trial_log import CountedTrial
 
+YAW, POSITION = "object_yaw_deg", "object_y_m"
+TASK = make_task(TaskConfig())
 Believes = Callable[[str, float], float]
 
 
@@ -30,12 +35,15 @@ def outcome(situation: Mapping[str, float], believes: Believes) -> Outcome:
     offset_mm = 1e3 * (believes(POSITION, situation[POSITION]) - situation[POSITION])
     along, across = offset_mm * np.cos(np.deg2rad(yaw)), -offset_mm * np.sin(np.deg2rad(yaw))
     precise = abs(yaw_error) <= 10 and abs(along) <= 20 and abs(across) <= 10
-    reason = Reason.NONE if precise else Reason.IMPRECISE
-    return Outcome(True, True, precise, reason, 0.1, 0, 0, yaw_error, along, across, 80, -1)
+    reason = NO_FAILURE if precise else "imprecise"
+    measured = measures(
+        moved_mm=0, turned_deg=0, yaw_error_deg=yaw_error, along_mm=along, across_mm=across
+    )
+    return Outcome(True, True, precise, reason, measured)
 
 
 def play(believes: Believes, count: int = 400, version: int = 1) -> list[CountedTrial]:
-    situations = [Experiment1().sample(seed) for seed in range(count)]
+    situations = [TASK.sample(seed) for seed in range(count)]
     return [
         CountedTrial("run", version, seed, f"e{seed}", "local", each, outcome(each, believes))
         for seed, each in enumerate(situations)
@@ -61,14 +69,14 @@ def test_the_share_of_snapping_is_found_beside_other_errors(name: str, share: fl
         snapped = pulled + share * (nearest(name, value) - value)
         return snapped + noise[name] * random.normal()
 
-    found = snapping(Trials.of(play(believes), Experiment1()), name)
+    found = snapping(Trials.of(play(believes), TASK), name)
     assert found is not None
     assert found.share == pytest.approx(share, abs=0.03)
     assert found.half_width < 0.06
 
 
 def test_success_near_tutored_values_and_between_them_is_told_apart() -> None:
-    found = numbers(Trials.of(play(nearest), Experiment1()))
+    found = numbers(Trials.of(play(nearest), TASK))
     for name in (YAW, POSITION):
         places = found["near_and_between"][name]
         assert places["near"]["precise"]["rate"] > places["between"]["precise"]["rate"] + 0.1
@@ -129,4 +137,4 @@ def test_trials_of_another_task_are_refused() -> None:
     (trial,) = play(nearest, 1)
     foreign = CountedTrial("run", 1, 0, "e", "local", {"object_y_m": 0.2}, trial.outcome)
     with pytest.raises(UserError, match="a situation has"):
-        Trials.of([foreign], Experiment1())
+        Trials.of([foreign], TASK)

@@ -11,7 +11,7 @@ import pytest
 from learner.tutoring.store import TutoringStore
 from proto.config import Config, load_config
 from services.cli import main
-from services.trials import sweeps as sweep
+from services.trials import sweeps
 from services.trials.success import Rate, difference95
 
 QUICK = (
@@ -63,15 +63,15 @@ def test_one_command_trains_tests_and_draws_and_does_nothing_twice(
 
 def test_a_training_that_was_stopped_goes_on(recordings: Path, tmp_path: Path) -> None:
     values = {"learner": {"pretraining": {"epochs": 1}, "epochs": 2, "warmup_epochs": 1}}
-    variant = sweep.Variant("short", Config.model_validate(values))
-    (member,) = sweep.members_of([variant], [1], tmp_path)
+    variant = sweeps.Variant("short", Config.model_validate(values))
+    (run,) = sweeps.open_runs([variant], [1], tmp_path)
     store = TutoringStore(recordings)
-    done = [sweep.epochs_done(member)]
-    while not sweep.train(member, store, None, lambda _loss: False):
-        done.append(sweep.epochs_done(member))
-    done.append(sweep.epochs_done(member))
+    done = [sweeps.epochs_done(run)]
+    while not sweeps.train(run, store, None, lambda _loss: False):
+        done.append(sweeps.epochs_done(run))
+    done.append(sweeps.epochs_done(run))
     assert done == [0, 1, 2, 3]
-    assert done[-1] == sweep.epochs_of(member)
+    assert done[-1] == sweeps.epochs_total(run)
 
 
 def test_the_interval_of_a_difference_is_newcombes() -> None:

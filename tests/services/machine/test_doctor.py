@@ -1,4 +1,4 @@
-"""The doctor finds what is wrong and says what to do."""
+"""`vmdnn doctor` finds what is wrong with a machine and says what to do."""
 
 from __future__ import annotations
 
@@ -9,22 +9,26 @@ from pathlib import Path
 
 import pytest
 
+from proto.config import SimulatorConfig
 from services.cli import main
 from services.machine.doctor import (
     LOCK,
+    Finding,
     check_cores,
     check_disk,
+    check_graphics,
     check_kernel,
+    check_locked_packages,
     check_memory,
-    check_packages,
     check_port,
     check_python,
+    check_required_packages,
     read_lock,
 )
 from tests.ports import free_endpoint
 
 
-def test_this_machine_is_well(capsys: pytest.CaptureFixture[str]) -> None:
+def test_this_machine_has_no_problem(capsys: pytest.CaptureFixture[str]) -> None:
     status = main(["doctor", "--json", "--set", f"hub.endpoint={free_endpoint()}"])
     findings = {finding["check"]: finding for finding in json.loads(capsys.readouterr().out)}
     assert set(findings) == {
@@ -44,14 +48,14 @@ def test_a_problem_gives_status_1_and_advice(capsys: pytest.CaptureFixture[str])
 
 
 def test_the_lock_is_installed_exactly() -> None:
-    finding = check_packages(LOCK)
+    finding = check_locked_packages(LOCK)
     assert finding.ok, finding
 
 
 def test_other_and_missing_packages_are_named(tmp_path: Path) -> None:
     lock = tmp_path / "requirements.lock"
     lock.write_text(f"# a comment\nnumpy=={version('numpy')}\nrich==0.0.1\nno-such-package==1.0\n")
-    finding = check_packages(lock)
+    finding = check_locked_packages(lock)
     assert not finding.ok
     assert f"rich {version('rich')} instead of 0.0.1" in finding.found
     assert "no-such-package missing instead of 1.0" in finding.found
@@ -59,8 +63,57 @@ def test_other_and_missing_packages_are_named(tmp_path: Path) -> None:
     assert str(lock) in finding.advice
 
 
-def test_without_a_lock_it_says_where_to_run(tmp_path: Path) -> None:
-    assert "checkout" in check_packages(tmp_path / "requirements.lock").advice
+def test_without_a_lock_it_checks_what_the_distribution_requires(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("services.machine.doctor.LOCK", tmp_path / "requirements.lock")
+    main(["doctor", "--json", "--set", "simulator.render=false"])
+    findings = {finding["check"]: finding for finding in json.loads(capsys.readouterr().out)}
+    assert findings["packages"]["ok"], findings["packages"]
+    assert "as vmdnn requires" in findings["packages"]["found"]
+
+
+def test_missing_and_unfit_requirements_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    metadata = tmp_path / "robots-1.0.dist-info" / "METADATA"
+    metadata.parent.mkdir()
+    metadata.write_text(
+        "Metadata-Version: 2.1\nName: robots\nVersion: 1.0\n"
+        "Requires-Dist: numpy>=1\n"
+        "Requires-Dist: rich>=1000\n"
+        "Requires-Dist: no-such-package\n"
+        'Requires-Dist: not-needed; extra == "dev"\n'
+        'Requires-Dist: not-for-us; sys_platform == "win32"\n'
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    finding = check_required_packages("robots")
+    assert finding.found == f"rich>=1000 ({version('rich')}), no-such-package (missing)"
+    assert finding.advice.endswith("-m pip install 'rich>=1000' 'no-such-package'")
+
+
+def test_without_lock_and_distribution_it_says_what_to_install() -> None:
+    assert "checkout" in check_required_packages("no-such-distribution").advice
+
+
+def test_the_chosen_backend_is_asked_about_graphics(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "blind_backend.py").write_text(
+        "from actors.backends.sapien.simulator import SapienSimulator\n"
+        "from actors.simulator import Diagnosis\n"
+        "class Blind(SapienSimulator):\n"
+        "    @staticmethod\n"
+        "    def diagnose():\n"
+        "        return Diagnosis(False, 'no light', 'buy a lamp')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    own = SimulatorConfig(backend="blind_backend:Blind")
+    assert check_graphics(own) == Finding("graphics", "no light", "buy a lamp")
+    assert check_graphics(own.model_copy(update={"render": False})).ok
+    unknown = check_graphics(SimulatorConfig(backend="sapiens"))
+    assert "there is no 'sapiens'" in unknown.found
+    assert "--set simulator.backend=" in unknown.advice
 
 
 def test_too_little_of_anything_is_a_problem(tmp_path: Path) -> None:

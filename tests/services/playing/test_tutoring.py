@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 from processes import eventually
 
-from actors.tasks.experiment1.reaching import Reaching
-from actors.tasks.experiment1.task import Experiment1
+from actors.tasks.registry import make_task
+from proto.config import TaskConfig
 from proto.episode import Kind
 from proto.errors import UserError
 from proto.recordings.episodes import read_episode
 from services.cli import main
 from services.playing.tutoring import parse_cases
 
+TASK = make_task(TaskConfig())
+REACHING = make_task(TaskConfig(name="reaching"))
 NAMES = [f"case{case:02d}_repeat{repeat:02d}.mcap" for case in (3, 41) for repeat in (0, 1)]
 
 
@@ -35,7 +37,7 @@ def test_each_case_is_executed_clean_and_then_with_noise(recordings: Path) -> No
         clean = read_episode(recordings / f"case{case:02d}_repeat00.mcap")
         noisy = read_episode(recordings / f"case{case:02d}_repeat01.mcap")
         assert clean.kind is Kind.TUTORING
-        assert clean.situation == noisy.situation == Experiment1().tutored()[case]
+        assert clean.situation == noisy.situation == TASK.tutored()[case]
         assert (clean.seed, noisy.seed) == (case * 1000, case * 1000 + 1)
         assert np.array_equal(clean.actions, clean.targets)
         # The target stays the clean plan: the sequence shows how to come back to it.
@@ -86,17 +88,17 @@ def test_another_tutor_is_not_mixed_in(
     [("all", list(range(45))), ("0,3,7", [0, 3, 7]), ("0-3", [0, 1, 2, 3]), ("7,0-1,1", [0, 1, 7])],
 )
 def test_cases_can_be_listed(text: str, cases: list[int]) -> None:
-    task = Experiment1()
+    task = TASK
     listed = parse_cases(text, task, seed=0)
     assert [case.number for case in listed] == cases
     assert [case.situation for case in listed] == [task.tutored()[case] for case in cases]
 
 
 def test_more_random_cases_are_the_same_and_others() -> None:
-    few, more = (parse_cases(f"random:{count}", Reaching(), seed=500) for count in (2, 4))
+    few, more = (parse_cases(f"random:{count}", REACHING, seed=500) for count in (2, 4))
     assert more[:2] == few
     assert [case.name for case in more] == [f"random00050{i}" for i in range(4)]
-    assert [case.situation for case in more] == [Reaching().sample(500 + i) for i in range(4)]
+    assert [case.situation for case in more] == [REACHING.sample(500 + i) for i in range(4)]
 
 
 def test_random_cases_are_recorded_where_others_were(tmp_path: Path) -> None:
@@ -111,7 +113,7 @@ def test_random_cases_are_recorded_where_others_were(tmp_path: Path) -> None:
     ]
     *_, clean, noisy = map(read_episode, recorded)
     assert clean.task == "reaching"
-    assert clean.situation == noisy.situation == Reaching().sample(7)
+    assert clean.situation == noisy.situation == REACHING.sample(7)
     assert not np.array_equal(clean.actions, noisy.actions)
     assert "obstacle" not in clean.body_names
 
@@ -121,7 +123,7 @@ def test_random_cases_are_recorded_where_others_were(tmp_path: Path) -> None:
 )
 def test_cases_that_are_not_there_are_refused(text: str) -> None:
     with pytest.raises(UserError, match="--cases"):
-        parse_cases(text, Experiment1(), seed=0)
+        parse_cases(text, TASK, seed=0)
 
 
 def test_ctrl_c_stops_cleanly(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -89,11 +90,41 @@ def test_a_recovered_episode_can_be_seen(recordings: Path, tmp_path: Path) -> No
     assert len(read_video(out)[0]) == 1
 
 
+OWN_BACKEND = """
+import numpy as np
+
+from actors.backends.sapien.simulator import SapienSimulator
+
+
+class Blue(SapienSimulator):
+    def outside_picture(self, width, height):
+        return np.full((height, width, 3), (0, 0, 255), dtype=np.uint8)
+"""
+
+
+def test_an_episode_of_a_backend_of_ones_own_is_replayed_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    (tmp_path / "own_backend.py").write_text(OWN_BACKEND)
+    tutor = "tutor --cases 3 --repeats 1 --workers 1 --out . --backend own_backend:Blue"
+    assert main(tutor.split()) == 0
+    episode = read_episode(Path("case03_repeat00.mcap"))
+    assert episode.backend == "own_backend:Blue"
+    write_episode(Path("short.mcap"), steps_of(episode, [60]))
+    assert main(["replay", "short.mcap", "--out", "own.mp4"]) == 0
+    frame = read_video(Path("own.mp4"))[0][0]
+    outside, eye = frame[150:, :640], frame[150:, 640:]
+    assert outside.mean(axis=(0, 1)) == pytest.approx((255, 0, 0), abs=10), "blue green red"
+    assert eye.std() > 20, "something is to be seen"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--out", "video.avi"], "must end in .mp4"),
-        (["--out", "video.mp4", "--backend", "nothing"], "no backend 'nothing'"),
+        (["--out", "video.mp4", "--backend", "nothing"], "there is no 'nothing'"),
     ],
 )
 def test_bad_input_says_what_to_do(

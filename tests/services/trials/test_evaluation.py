@@ -9,17 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from actors.tasks.experiment1.task import Experiment1
+from actors.tasks.registry import make_task
 from learner.network_policy import NetworkPolicy
-from proto.config import Config
+from proto.config import Config, TaskConfig
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.recordings.episodes import read_episode
+from proto.variables import parse_situation
 from services.cli import main
 from services.playing.workers import play_all
-from services.trials.evaluation import parse_situation, trial_jobs
+from services.trials.evaluation import trial_jobs
 from services.trials.success import Tally, wilson95
 from services.trials.trial_log import read_trials
+
+TASK = make_task(TaskConfig())
 
 
 def evaluate(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
@@ -60,7 +63,7 @@ def test_rollouts_are_kept_with_the_seeds_situations(
 ) -> None:
     result = evaluate(capsys, *f"--policy lookup --trials 2 --seed 40 --out {tmp_path}".split())
     kept = [read_episode(tmp_path / f"trial{trial:04d}.mcap") for trial in range(2)]
-    assert [episode.situation for episode in kept] == [Experiment1().sample(40 + i) for i in (0, 1)]
+    assert [episode.situation for episode in kept] == [TASK.sample(40 + i) for i in (0, 1)]
     assert {(episode.kind, episode.policy) for episode in kept} == {(Kind.TRIAL, "lookup")}
     assert sum(episode.outcome.strict for episode in kept) == result["strict"]["successes"]
     assert kept[0].images.any(), "what is kept is seen, even if the policy does not look"
@@ -88,7 +91,7 @@ def test_given_situations_are_played_and_their_states_kept(
     words = f"--policy {checkpoint} --situation {situation} --seed 7 --states --out {tmp_path}"
     assert evaluate(capsys, *words.split())["trials"] == 1
     episode = read_episode(tmp_path / "trial0000.mcap")
-    assert episode.situation == parse_situation(situation)
+    assert episode.situation == parse_situation(situation, TASK.variables, TASK.name)
     assert episode.seed == 7
     assert episode.states is not None
     units = {name: activity.shape for name, activity in episode.states.items()}
@@ -109,7 +112,7 @@ def test_outcomes_are_kept_without_rollouts(
     path = tmp_path / "outcomes.jsonl"
     result = evaluate(capsys, *f"--policy replay --trials 3 --seed 9 --outcomes {path}".split())
     trials = read_trials(path)
-    assert [trial.situation for trial in trials] == [Experiment1().sample(9 + i) for i in range(3)]
+    assert [trial.situation for trial in trials] == [TASK.sample(9 + i) for i in range(3)]
     assert [trial.seed for trial in trials] == [9, 10, 11]
     assert {trial.run_id for trial in trials} == {"replay"}
     kept = Tally.of(trial.outcome for trial in trials).as_json()

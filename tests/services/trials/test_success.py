@@ -7,9 +7,9 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from outcomes import IMPRECISE, NOT_LIFTED, PRECISE, TOUCHED
 from scipy.stats import binomtest
 
-from proto.episode import Outcome, Reason
 from services.trials.success import READINGS, Tally, wilson95
 
 
@@ -24,17 +24,8 @@ def test_the_interval_agrees_with_scipy(counts: tuple[int, int]) -> None:
     assert wilson95(*counts) == pytest.approx((expected.low, expected.high), abs=1e-9)
 
 
-def outcome(lenient: bool, strict: bool, precise: bool, reason: Reason) -> Outcome:
-    return Outcome(lenient, strict, precise, reason, 0.1, 1.0, 1.0, 1.0, 1.0, 1.0, 80, -1)
-
-
 def test_a_tally_counts_each_reading_and_reason() -> None:
-    tally = Tally.of(
-        [outcome(True, True, True, Reason.NONE)] * 5
-        + [outcome(True, True, False, Reason.IMPRECISE)] * 2
-        + [outcome(True, False, False, Reason.TOUCHED_OBSTACLE)]
-        + [outcome(False, False, False, Reason.NOT_LIFTED)] * 2
-    )
+    tally = Tally.of([PRECISE] * 5 + [IMPRECISE] * 2 + [TOUCHED] + [NOT_LIFTED] * 2)
     told = json.loads(json.dumps(tally.as_json()))
     assert told["trials"] == 10
     assert [told[reading]["successes"] for reading in READINGS] == [8, 7, 5]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from outcomes import PRECISE, measures
 
 from proto.episode import Episode, Kind
+from proto.errors import UserError
 from proto.messages import Rollout
-from services.trials.trial_log import TrialLog
+from services.trials.trial_log import TrialLog, read_trials
 
 MakeEpisode = Callable[..., Episode]
 
@@ -67,3 +70,22 @@ def test_a_damaged_line_is_skipped_and_told(
     path.write_bytes(lines[0] + lines[1].replace(b'"strict"', b'"strikt"') + lines[2])
     assert sorted(TrialLog(path).outcomes("run", 1)) == [1, 3]
     assert "line 2 is not counted: outcome" in caplog.text
+
+
+def test_lines_of_format_1_are_read_as_what_they_meant(tmp_path: Path) -> None:
+    old = Path(__file__).parents[2] / "data" / "format1" / "trials.jsonl"
+    touched, precise = read_trials(old)
+    assert touched.outcome.reason == "touched_obstacle"
+    assert touched.outcome.measures == measures(yaw_error_deg=11, obstacle_touched_at=30)
+    assert precise.outcome == replace(PRECISE, measures=measures(closed_at=81))
+    path = tmp_path / "trials.jsonl"
+    path.write_bytes(old.read_bytes())
+    assert sorted(TrialLog(path).outcomes("run", 3)) == [3001, 3002]
+
+
+def test_lines_of_a_newer_format_say_so(tmp_path: Path, trial: Callable[..., Rollout]) -> None:
+    path = tmp_path / "trials.jsonl"
+    TrialLog(path).add(trial(5))
+    path.write_text(path.read_text().replace('"format": 2', '"format": 3'))
+    with pytest.raises(UserError, match="3 was written by a newer vmdnn"):
+        read_trials(path)

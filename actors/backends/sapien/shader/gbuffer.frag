@@ -1,6 +1,6 @@
 #version 450
-// Matt surfaces under a bright sky and a sun behind the robot's left shoulder, without shadows.
-// SAPIEN's own shaders do far more; compiling them takes seconds, and this one draws twice as fast.
+// Matt surfaces in the light of actors/backends/light.py, without shadows.
+// SAPIEN's own shaders take seconds to compile, and twice as long to draw.
 
 layout(set = 2, binding = 0) uniform MaterialBuffer {
   vec4 emission;
@@ -16,6 +16,13 @@ layout(set = 2, binding = 0) uniform MaterialBuffer {
   vec4 textureTransforms[6];
 } material;
 
+layout(set = 2, binding = 1) uniform sampler2D colorTexture;
+layout(set = 2, binding = 2) uniform sampler2D roughnessTexture;
+layout(set = 2, binding = 3) uniform sampler2D normalTexture;
+layout(set = 2, binding = 4) uniform sampler2D metallicTexture;
+layout(set = 2, binding = 5) uniform sampler2D emissionTexture;
+layout(set = 2, binding = 6) uniform sampler2D transmissionTexture;
+
 struct PointLight { vec4 position; vec4 emission; };
 struct DirectionalLight { vec4 direction; vec4 emission; };
 struct SpotLight { vec4 position; vec4 direction; vec4 emission; };
@@ -29,15 +36,23 @@ layout(set = 3, binding = 0) uniform SceneBuffer {
 } scene;
 
 layout(location = 0) in vec3 worldNormal;
+layout(location = 1) in vec2 textureUV;
 layout(location = 0) out vec4 outColor;
 
 const vec3 TO_SUN = vec3(-0.26, -0.43, 0.865);
 const float SUN = 0.4;
 const float SKY = 0.55;
 const float GROUND = 0.35;
+const float GAMMA = 2.2;
+
+const int HAS_EMISSION_TEXTURE = 16;  // bit of textureMask
 
 void main() {
+  if ((material.textureMask & HAS_EMISSION_TEXTURE) != 0) {  // a screen glows by itself
+    outColor = vec4(texture(emissionTexture, textureUV).rrr, 1.0);
+    return;
+  }
   vec3 normal = normalize(worldNormal);
   float light = mix(GROUND, SKY, 0.5 + 0.5 * normal.z) + SUN * max(dot(normal, TO_SUN), 0.0);
-  outColor = vec4(pow(light * material.baseColor.rgb, vec3(1.0 / 2.2)), 1.0);
+  outColor = vec4(pow(light * material.baseColor.rgb, vec3(1.0 / GAMMA)), 1.0);
 }

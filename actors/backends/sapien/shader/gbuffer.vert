@@ -1,5 +1,5 @@
 #version 450
-// Places the vertices of one shape. SAPIEN finds the buffers by these declarations.
+// Transforms the vertices of one shape. SAPIEN binds its buffers by these declarations.
 
 layout(set = 0, binding = 0) uniform CameraBuffer {
   mat4 viewMatrix;
@@ -22,12 +22,15 @@ layout(set = 1, binding = 1) uniform ObjectDataBuffer {
 
 layout(location = 0) in vec3 position;
 layout(location = 1) in vec3 normal;
+layout(location = 2) in vec2 uv;
 
 layout(location = 0) out vec3 worldNormal;
+layout(location = 1) out vec2 textureUV;
 
 void main() {
-  // Nothing is scaled unevenly, so normals turn like everything else.
+  // No shape is scaled, so normals are rotated as the shape is.
   worldNormal = mat3(object.modelMatrix) * normal;
+  textureUV = uv;
   gl_Position =
       camera.projectionMatrix * camera.viewMatrix * object.modelMatrix * vec4(position, 1.0);
 }

@@ -3,27 +3,28 @@
 import itertools
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actors.kinematics import Arm, Cuboid, Gaze
+from actors.kinematics import Arm, ClearanceBox, Gaze
 from actors.tasks.experiment1.fitting import PostureFitter
-from actors.tasks.experiment1.plan import execution_noise, plan
+from actors.tasks.experiment1.plan import plan
 from actors.tasks.experiment1.postures import load_key_postures
-from actors.tasks.experiment1.task import (
+from actors.tasks.experiment1.world import (
     OBSTACLE_SIZE_M,
     START,
     TABLE_DROP_M,
-    Experiment1,
     object_pose,
     obstacle_pose,
 )
+from actors.tasks.registry import make_task
 from proto.body import ACTION_VALUES, ARM, FOCUS, GRASP, NECK
+from proto.config import TaskConfig
 from sim_assets.hand import OPEN_DEG
 
+TASK = make_task(TaskConfig())
 situations = st.fixed_dictionaries(
-    {name: st.floats(*limits) for name, limits in Experiment1().ranges().items()}
+    {each.name: st.floats(each.minimum, each.maximum) for each in TASK.variables}
 )
 ARM_OPEN = Arm(OPEN_DEG, TABLE_DROP_M)
 
@@ -44,7 +45,7 @@ def test_plan_stays_within_the_limits_and_moves_smoothly(situation):
 @settings(max_examples=25)
 def test_open_arm_passes_the_obstacle_closely_but_clear(situation):
     actions = plan(situation)
-    box = Cuboid(np.array(obstacle_pose(situation).position_m), np.array(OBSTACLE_SIZE_M))
+    box = ClearanceBox(np.array(obstacle_pose(situation).position_m), np.array(OBSTACLE_SIZE_M))
     approach = np.deg2rad(actions[actions[:, GRASP] <= 1.0][:, ARM])
     clearance = min(
         (box.distance(ARM_OPEN.pose(posture).points_m) - ARM_OPEN.radii_m).min()
@@ -54,7 +55,7 @@ def test_open_arm_passes_the_obstacle_closely_but_clear(situation):
 
 
 def test_neighbouring_cases_have_neighbouring_plans():
-    plans = {tuple(case.values()): plan(case) for case in Experiment1().tutored()}
+    plans = {tuple(case.values()): plan(case) for case in TASK.tutored()}
     axes = [sorted({key[axis] for key in plans}) for axis in range(3)]
     steps = [
         np.abs(plans[a] - plans[b])[:, ARM].max()
@@ -66,15 +67,15 @@ def test_neighbouring_cases_have_neighbouring_plans():
 
 
 def test_attention_follows_the_subtasks():
-    task = Experiment1()
+    task = TASK
     situation = task.sample(3)
     actions = plan(situation)
-    looking_at_object = actions[task.phases == 5]
+    looking_at_object = actions[task.phases == 4]
     assert np.ptp(looking_at_object[:, NECK], axis=0).max() < 0.1
-    assert (actions[task.phases <= 5][:, FOCUS] == 1.0).all()
-    assert (actions[task.phases >= 7][:, FOCUS] == 20.0).all()
-    assert (actions[task.phases <= 6][:, GRASP] == 1.0).all()
-    assert (actions[task.phases == 8][:, GRASP] == 10.0).all()
+    assert (actions[task.phases <= 4][:, FOCUS] == 1.0).all()
+    assert (actions[task.phases >= 6][:, FOCUS] == 20.0).all()
+    assert (actions[task.phases <= 5][:, GRASP] == 1.0).all()
+    assert (actions[task.phases == 7][:, GRASP] == 10.0).all()
 
 
 def test_gaze_centres_what_the_neck_can_reach():
@@ -93,14 +94,3 @@ def test_fitted_postures_are_those_that_lie_in_the_repository():
     for postures in ("object", "obstacle"):
         for name, rows in getattr(stored, postures).items():
             np.testing.assert_allclose(getattr(fitted, postures)[name], rows, atol=0.05)
-
-
-def test_noise_is_smooth_seeded_and_of_the_size_asked_for():
-    noise = np.concatenate([execution_noise(124, seed, 1.0, 20.0) for seed in range(200)])
-    late = noise.reshape(200, 124, 11)[:, 40:]
-    assert late[..., ARM].std() == pytest.approx(1.0, abs=0.1)
-    assert np.abs(np.diff(late, axis=1)).max() < 0.6
-    assert (noise[..., [GRASP, FOCUS]] == 0.0).all()
-    np.testing.assert_array_equal(execution_noise(50, 7, 1, 20), execution_noise(50, 7, 1, 20))
-    assert np.abs(execution_noise(50, 7, 1, 20) - execution_noise(50, 8, 1, 20)).max() > 0.1
-    assert (execution_noise(50, 7, 0.0, 20.0) == 0.0).all()

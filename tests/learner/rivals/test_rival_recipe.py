@@ -23,11 +23,14 @@ from learner.network.vmdnn import VMDNN
 from learner.network_policy import NetworkPolicy
 from learner.rivals.networks import make_rival, rival_config, weights_of
 from learner.rivals.rival_policy import RivalPolicy
-from learner.rivals.training import RivalTrainer, train_rival
+from learner.rivals.rival_recipe import make_recipe
+from learner.training.trainer import Trainer
+from learner.training.training_run import open_training, run_training
 from learner.tutoring.store import TutoringStore
 from proto.config import Config, RivalKind
 from proto.episode import Episode
 from proto.errors import UserError
+from proto.variables import Question
 
 KINDS = get_args(RivalKind)
 
@@ -38,6 +41,21 @@ def store(tmp_path: Path, bar_episodes: Callable[..., Sequence[Episode]]) -> Tut
     for episode in bar_episodes(steps=12):
         store.add(episode)
     return store
+
+
+def open_rival(folder: Path, kind: RivalKind, store: TutoringStore, *epochs: int) -> Trainer:
+    return open_training(make_recipe(config(*epochs), kind), folder, store)
+
+
+def train(
+    folder: Path,
+    kind: RivalKind,
+    store: TutoringStore,
+    go_on: Callable[[float], bool] = lambda _: True,
+) -> bool:
+    trainer = open_rival(folder, kind, store)
+    run_training(trainer, folder, go_on)
+    return trainer.finished
 
 
 def config(together: int = 3, epochs: int = 3) -> Config:
@@ -59,12 +77,15 @@ def test_it_has_about_as_many_weights_as_vmdnn(kind: RivalKind) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_learns_what_the_pictures_tell(
-    kind: RivalKind, store: TutoringStore, bar_episodes: Callable[..., Sequence[Episode]]
+    kind: RivalKind,
+    store: TutoringStore,
+    tmp_path: Path,
+    bar_episodes: Callable[..., Sequence[Episode]],
 ) -> None:
-    trainer = RivalTrainer(config(together=60, epochs=10), kind, store)
+    trainer = open_rival(tmp_path, kind, store, 60, 10)
     while not trainer.finished:
         trainer.epoch()
-    policy = RivalPolicy(checkpoint_from_bytes(trainer.policy_bytes(), "the policy"), "the policy")
+    policy = RivalPolicy(checkpoint_from_bytes(trainer.policy_bytes(1), "the policy"), "the policy")
     for left, right in (bar_episodes(slopes=[slope], steps=12) for slope in (-1.0, 1.0)):
         ends = []
         for episode in (left, right):
@@ -80,33 +101,34 @@ def test_a_training_that_was_stopped_goes_on_exactly(
     kind: RivalKind, store: TutoringStore, tmp_path: Path
 ) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    assert train_rival(config(), kind, whole, store, lambda _: True)
+    assert train(whole, kind, store)
     stops = 0
-    while not train_rival(config(), kind, parts, store, lambda _: False):
+    while not train(parts, kind, store, lambda _: False):
         stops += 1
     assert stops == 5  # of 6 epochs in both stages
     assert policy_file(whole, 1).read_bytes() == policy_file(parts, 1).read_bytes()
-    assert train_rival(config(), kind, parts, store, lambda _: True), "nothing is left to do"
+    assert train(parts, kind, store), "nothing is left to do"
+    assert len(list(policy_file(whole, 1).parent.iterdir())) == 1, "one policy, at the end"
 
 
 def test_the_vision_stays_as_the_first_stage_left_it(store: TutoringStore, tmp_path: Path) -> None:
     epochs = iter(range(1, 7))
-    train_rival(config(), "cnn-lstm", tmp_path, store, lambda _: next(epochs) < 3)
+    train(tmp_path, "cnn-lstm", store, lambda _: next(epochs) < 3)
     formed = load_checkpoint(training_file(tmp_path)).part(NETWORK_PREFIX)
-    train_rival(config(), "cnn-lstm", tmp_path, store, lambda _: True)
+    train(tmp_path, "cnn-lstm", store)
     final = load_checkpoint(policy_file(tmp_path, 1)).part(NETWORK_PREFIX)
     changed = {name for name in formed if not np.array_equal(formed[name], final[name])}
     assert changed == {name for name in formed if not name.startswith("eye.")}
 
 
 @pytest.fixture
-def trained(store: TutoringStore) -> Callable[[RivalKind], Checkpoint]:
-    def train(kind: RivalKind) -> Checkpoint:
-        trainer = RivalTrainer(config(), kind, store)
+def trained(store: TutoringStore, tmp_path: Path) -> Callable[[RivalKind], Checkpoint]:
+    def train_one_epoch(kind: RivalKind) -> Checkpoint:
+        trainer = open_rival(tmp_path, kind, store)
         trainer.epoch()
-        return checkpoint_from_bytes(trainer.policy_bytes(), "the policy")
+        return checkpoint_from_bytes(trainer.policy_bytes(1), "the policy")
 
-    return train
+    return train_one_epoch
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -155,6 +177,8 @@ def test_foreign_and_damaged_networks_are_refused(
     rest = {name: tensor for name, tensor in checkpoint.tensors.items() if "eye" not in name}
     with pytest.raises(UserError, match="does not hold what its metadata describes"):
         RivalPolicy(Checkpoint(checkpoint.metadata, rest), "it")
-    train_rival(config(), "cnn-lstm", tmp_path, store, lambda _: False)
-    with pytest.raises(UserError, match="another network or of other sequences"):
-        train_rival(config(), "feed-forward", tmp_path, store, lambda _: False)
+    train(tmp_path, "cnn-lstm", store, lambda _: False)
+    with pytest.raises(UserError, match="cnn-lstm with 12 units, not feed-forward with 12 units"):
+        train(tmp_path, "feed-forward", store)
+    with pytest.raises(UserError, match="cnn-lstm with 12 units, not VMDNN"):
+        open_training(make_recipe(config(), None, [Question("object_y_m", 3)]), tmp_path, store)

@@ -1,0 +1,138 @@
+"""Reads the three readings of success in Experiment I.
+
+- lenient, the paper's: the object ends more than 5 cm above its start;
+- strict: lifted and held, the obstacle never touched, the object moved by at most 10 mm and turned
+  by at most 5 degrees before the hand closes;
+- precise: strict, and the hand's pose to the object was right when it closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from actors.simulator import Pose, StepReport
+from actors.tasks.experiment1.world import object_pose
+from actors.tasks.grasp_reading import HandOffset, closed_at, half_turn, hand_offset, yaw_deg
+from proto.episode import NO_FAILURE, Measure, Outcome
+from proto.variables import Situation
+from sim_assets.icub import HAND
+
+Array = NDArray[np.float64]
+
+LIFTED_M: Final = 0.05
+HELD_STEPS: Final = 5
+MOVED_MM: Final = 10.0
+TURNED_DEG: Final = 5.0
+YAW_ERROR_DEG: Final = 10.0
+ALONG_MM: Final = 20.0
+ACROSS_MM: Final = 10.0
+
+TOUCHED_OBSTACLE: Final = "touched_obstacle"
+MOVED_OBJECT: Final = "moved_object"
+NEVER_CLOSED: Final = "never_closed"
+NOT_LIFTED: Final = "not_lifted"
+IMPRECISE: Final = "imprecise"
+
+
+@dataclass(frozen=True)
+class _Instant:
+    """The state after one control step."""
+
+    joints_deg: Array
+    touched: bool
+    bodies: Mapping[str, Pose]
+
+
+@dataclass(frozen=True)
+class _Approach:
+    """How the hand came to the object.
+
+    Attributes:
+        moved_mm: how far the object had moved.
+        turned_deg: how far the object had turned.
+        hand: pose of the hand relative to the object.
+    """
+
+    moved_mm: float
+    turned_deg: float
+    hand: HandOffset
+
+
+class Experiment1Judge:
+    """Judges one episode from true poses and the measured hand.
+
+    Measures: `lifted_m`, height of the object above its start at the end; the attributes of
+    `_Approach` and `HandOffset` at the last step before the hand closed; `closed_at`, the step at
+    which it closed; `obstacle_touched_at`, the first step in which the obstacle was touched. A step
+    that never came is -1.
+    """
+
+    def __init__(self, situation: Situation) -> None:
+        """Start watching an episode of `situation`."""
+        self._start = object_pose(situation)
+        self._instants: list[_Instant] = []
+
+    def watch(self, report: StepReport, joints_deg: Array, bodies: Mapping[str, Pose]) -> None:
+        """Take note of one control step that has just been run."""
+        touched = any(box == "obstacle" for box, _ in report.touches)
+        self._instants.append(_Instant(joints_deg, touched, bodies))
+
+    def outcome(self) -> Outcome:
+        """How the episode went, once its last step was watched."""
+        instants = self._instants
+        closed_step = closed_at(instant.joints_deg for instant in instants)
+        # The last instant at which the hand was still open tells how it came to the object.
+        before = self._approach(
+            instants[max(closed_step - 1, 0)] if closed_step >= 0 else instants[-1]
+        )
+        touched_at = next((k for k, instant in enumerate(instants) if instant.touched), -1)
+        lifted_m = [self._lifted_m(instant) for instant in instants[-HELD_STEPS:]]
+        lenient = lifted_m[-1] > LIFTED_M
+        held = min(lifted_m) > LIFTED_M
+        unmoved = before.moved_mm <= MOVED_MM and before.turned_deg <= TURNED_DEG
+        strict = held and unmoved and closed_step >= 0 and touched_at < 0
+        right = (
+            abs(before.hand.yaw_error_deg) <= YAW_ERROR_DEG
+            and abs(before.hand.along_mm) <= ALONG_MM
+            and abs(before.hand.across_mm) <= ACROSS_MM
+        )
+        failures = (
+            (touched_at >= 0, TOUCHED_OBSTACLE),
+            (not unmoved, MOVED_OBJECT),
+            (closed_step < 0, NEVER_CLOSED),
+            (not held, NOT_LIFTED),
+            (not right, IMPRECISE),
+        )
+        return Outcome(
+            lenient=lenient,
+            strict=strict,
+            precise=strict and right,
+            reason=next((reason for failed, reason in failures if failed), NO_FAILURE),
+            measures={
+                "lifted_m": Measure(lifted_m[-1], "m"),
+                "moved_mm": Measure(before.moved_mm, "mm"),
+                "turned_deg": Measure(before.turned_deg, "deg"),
+                "yaw_error_deg": Measure(before.hand.yaw_error_deg, "deg"),
+                "along_mm": Measure(before.hand.along_mm, "mm"),
+                "across_mm": Measure(before.hand.across_mm, "mm"),
+                "closed_at": Measure(closed_step, "step"),
+                "obstacle_touched_at": Measure(touched_at, "step"),
+            },
+        )
+
+    def _lifted_m(self, instant: _Instant) -> float:
+        return instant.bodies["object"].position_m[2] - self._start.position_m[2]
+
+    def _approach(self, instant: _Instant) -> _Approach:
+        body = instant.bodies["object"]
+        moved = np.subtract(body.position_m, self._start.position_m)
+        return _Approach(
+            moved_mm=1e3 * float(np.hypot(moved[0], moved[1])),
+            turned_deg=float(abs(half_turn(yaw_deg(body) - yaw_deg(self._start)))),
+            hand=hand_offset(instant.bodies[HAND], body),
+        )

@@ -1,0 +1,113 @@
+"""Which clips are tutored and which are shown in trials: the task's options and what they give."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from proto.errors import UserError
+from sim_assets.gestures.clip import GestureLibrary
+from sim_assets.gestures.drawing import DrawnGestures
+from sim_assets.gestures.videos import GestureVideoError, RecordedGestures
+
+OPTIONS: Final = frozenset({"subjects", "takes", "poses", "trials_show", "gestures"})
+DRAWN_OPTIONS: Final = ("subjects", "takes", "trials_show")
+"""Options that a folder of videos decides."""
+NEW_TAKES: Final = "new-takes"
+NEW_SUBJECTS: Final = "new-subjects"
+NEW_SUBJECT_COUNT: Final = 8
+"""Number of subjects that only trials show."""
+
+
+@dataclass(frozen=True)
+class Clips:
+    """The clips of a task, by the names of their subjects and takes.
+
+    Attributes:
+        library: where they come from.
+        tutored_subjects: who points in tutored situations.
+        tutored_takes: the recordings of each of them, for either side.
+        trial_subjects: who points in trials.
+        trial_takes: the recordings of each of them, for either side.
+    """
+
+    library: GestureLibrary
+    tutored_subjects: tuple[str, ...]
+    tutored_takes: tuple[str, ...]
+    trial_subjects: tuple[str, ...]
+    trial_takes: tuple[str, ...]
+
+    @property
+    def subjects(self) -> tuple[str, ...]:
+        """All subjects, each once."""
+        return tuple(dict.fromkeys(self.tutored_subjects + self.trial_subjects))
+
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """All takes, each once."""
+        return tuple(dict.fromkeys(self.tutored_takes + self.trial_takes))
+
+
+def clips_of(options: Mapping[str, Any], task: str) -> Clips:
+    """The clips that the task's options ask for.
+
+    Args:
+        options: of OPTIONS, those that are set. `subjects` (1) and `takes` (10) are how many are
+            tutored, `trials_show` ("new-takes" or "new-subjects") is what trials show instead, and
+            `gestures` is a folder of videos, which is tutored and tested as a whole.
+        task: the task's name, for messages.
+
+    Raises:
+        UserError: an option has a value that it cannot have, or the videos cannot be used.
+    """
+    if "gestures" not in options:
+        return _drawn(options, task)
+    if given := [name for name in DRAWN_OPTIONS if name in options]:
+        raise UserError(
+            f"task.{given[0]}: the videos of task.gestures give the {task}'s subjects and takes;"
+            f" leave out task.{given[0]}"
+        )
+    return _recorded(options["gestures"])
+
+
+def count_of(options: Mapping[str, Any], name: str, default: int) -> int:
+    """The value of an option that is a number of things.
+
+    Raises:
+        UserError: it is no whole number of at least 1.
+    """
+    value = options.get(name, default)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise UserError(f"task.{name} = {value!r} is no whole number of at least 1")
+    return value
+
+
+def _drawn(options: Mapping[str, Any], task: str) -> Clips:
+    subjects, takes = count_of(options, "subjects", 1), count_of(options, "takes", 10)
+    shown = options.get("trials_show", NEW_TAKES)
+    if shown not in {NEW_TAKES, NEW_SUBJECTS}:
+        raise UserError(
+            f"task.trials_show = {shown!r}: trials of {task} show {NEW_TAKES} or {NEW_SUBJECTS}"
+        )
+    tutored = DrawnGestures(subjects, takes)
+    if shown == NEW_TAKES:
+        trial_subjects, trial_takes = tutored.subjects, _names(takes, 2 * takes)
+    else:
+        trial_subjects, trial_takes = _names(subjects, subjects + NEW_SUBJECT_COUNT), tutored.takes
+    return Clips(tutored, tutored.subjects, tutored.takes, trial_subjects, trial_takes)
+
+
+def _recorded(folder: object) -> Clips:
+    if not isinstance(folder, str | Path) or not str(folder):
+        raise UserError(f"task.gestures = {folder!r} is no name of a folder")
+    try:
+        library = RecordedGestures(Path(folder).expanduser())
+    except GestureVideoError as error:
+        raise UserError(f"task.gestures: {error}") from error
+    return Clips(library, library.subjects, library.takes, library.subjects, library.takes)
+
+
+def _names(first: int, end: int) -> tuple[str, ...]:
+    return tuple(str(number) for number in range(first, end))

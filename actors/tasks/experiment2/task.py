@@ -1,0 +1,161 @@
+"""Experiment II of the paper (section 4.3): grasp the object at which a person points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import product
+from typing import Final
+
+import numpy as np
+
+from actors.simulator import Scene
+from actors.tasks.contract import Array, Task
+from actors.tasks.experiment2 import world
+from actors.tasks.experiment2.baselines import BASELINES
+from actors.tasks.experiment2.clips import OPTIONS, Clips, clips_of, count_of
+from actors.tasks.experiment2.figure_words import FIGURE_WORDS
+from actors.tasks.experiment2.judge import Experiment2Judge
+from actors.tasks.experiment2.plan import plan
+from actors.tasks.experiment2.setting import (
+    INDICATED_X,
+    KINDS,
+    PLACES,
+    SUBJECT,
+    TAKE,
+    Place,
+    Setting,
+)
+from proto.config import TaskConfig
+from proto.errors import UserError
+from proto.variables import (
+    Continuous,
+    Discrete,
+    Question,
+    Situation,
+    Variable,
+    sample_situation,
+)
+
+TUTORED_POSES: Final = tuple(
+    (y_m, yaw_deg) for y_m in (0.26, *world.Y_RANGE_M) for yaw_deg in (0.0, *world.YAW_RANGE_DEG)
+)
+"""Y and yaw of tutored objects, the middle of the ranges first."""
+_CLIP_SEED: Final = 17
+_STEPS: Final = sum(world.SUBTASKS.values())
+
+
+def _window(first: int, last: int) -> tuple[float, float]:
+    """Control steps as shares of an episode."""
+    return (first / _STEPS, last / _STEPS)
+
+
+class Experiment2(Task):
+    """Experiment II. Trials are uniform inside the ranges, with clips that were not tutored.
+
+    Options: see `actors.tasks.experiment2.clips.clips_of`; and `poses` (9), the number of tutored
+    poses of the objects in each of the paper's eight cases.
+    """
+
+    name = "experiment2"
+    subtasks = world.SUBTASKS
+    start = world.START
+    # The gesture is asked for until the head turns to the object, which would give the answer away;
+    # kind and pose of the object are asked for once it is in view.
+    questions = (
+        Question("indicated_x_m", window=_window(20, 58)),
+        Question("indicated_kind", window=_window(64, 94)),
+        Question("indicated_y_m", 3, window=_window(74, 128)),
+        Question("indicated_yaw_deg", 3, window=_window(74, 128)),
+    )
+    baselines = BASELINES
+    figure_words = FIGURE_WORDS
+    options = OPTIONS
+
+    def __init__(self, config: TaskConfig) -> None:
+        """Make the task as the configuration's section `task` says.
+
+        Raises:
+            UserError: an option is unknown, has a wrong value, or the videos cannot be used.
+        """
+        super().__init__(config)
+        self._clips = clips_of(config.options, self.name)
+        self._poses = count_of(config.options, "poses", len(TUTORED_POSES))
+        self.variables = _variables(self._clips.subjects, self._clips.takes)
+        self._trial_variables = _variables(self._clips.trial_subjects, self._clips.trial_takes)
+
+    def tutored(self) -> Sequence[Situation]:
+        """The paper's eight cases, first with both objects in the middle, then in other poses."""
+        clips = {place: _tutored_clips(self._clips, place) for place in PLACES}
+        situations: list[Situation] = []
+        for number in range(self._poses):
+            indicated, other = _pose(number), _pose(4 * number + number // len(TUTORED_POSES))
+            for kind, other_kind, place in product(KINDS, KINDS, PLACES):
+                subject, take = next(clips[place])
+                values = (place, kind, *indicated, other_kind, *other, subject, take)
+                names = (variable.name for variable in self.variables)
+                situations.append(dict(zip(names, values, strict=True)))
+        return situations
+
+    def sample(self, seed: int) -> Situation:
+        """A situation of a trial; the same seed gives the same one."""
+        return sample_situation(self._trial_variables, seed)
+
+    def corners(self) -> Sequence[Situation]:
+        """The situations at the ends of all ranges, for each case of the paper; one clip a side."""
+        clip = {SUBJECT: self._clips.trial_subjects[0], TAKE: self._clips.trial_takes[0]}
+        return [
+            situation
+            for situation in super().corners()
+            if all(situation[name] == value for name, value in clip.items())
+        ]
+
+    def scene(self, situation: Situation) -> Scene:
+        """Table, objects, and the screen with the situation's clip.
+
+        Raises:
+            UserError: there is no such clip.
+        """
+        setting = Setting.of(situation)
+        try:
+            clip = self._clips.library.clip(setting.side, setting.subject, setting.take)
+        except ValueError as error:
+            raise UserError(f"{self.name}: there is no such clip: {error}") from error
+        return world.scene(setting, clip)
+
+    def plan(self, situation: Situation) -> Array:
+        """The tutor's actions (148, 11)."""
+        return plan(situation)
+
+    def judge(self, situation: Situation) -> Experiment2Judge:
+        """A judge for one episode of a situation."""
+        return Experiment2Judge(situation)
+
+
+def _variables(subjects: tuple[str, ...], takes: tuple[str, ...]) -> tuple[Variable, ...]:
+    return (
+        Discrete(INDICATED_X, PLACES),
+        Discrete("indicated_kind", KINDS),
+        Continuous("indicated_y_m", *world.Y_RANGE_M, "m"),
+        Continuous("indicated_yaw_deg", *world.YAW_RANGE_DEG, "deg"),
+        Discrete("other_kind", KINDS),
+        Continuous("other_y_m", *world.Y_RANGE_M, "m"),
+        Continuous("other_yaw_deg", *world.YAW_RANGE_DEG, "deg"),
+        Discrete(SUBJECT, subjects),
+        Discrete(TAKE, takes),
+    )
+
+
+def _pose(number: int) -> tuple[float, float]:
+    return TUTORED_POSES[number % len(TUTORED_POSES)]
+
+
+def _tutored_clips(clips: Clips, place: Place) -> Iterator[tuple[str, str]]:
+    """Subject and take for one tutored situation after the other, in a random order that is fixed.
+
+    All clips of a side come before one comes again, and kinds and poses tell nothing about them.
+    """
+    random = np.random.default_rng([_CLIP_SEED, PLACES.index(place)])
+    pairs = list(product(clips.tutored_subjects, clips.tutored_takes))
+    while True:
+        for index in random.permutation(len(pairs)):
+            yield pairs[index]

@@ -1,0 +1,181 @@
+"""How a rival is trained on tutored sequences.
+
+It gets everything that helps VMDNN: augmented images while its vision is formed, then vision noise
+and mixtures of neighbouring situations; warm-up, schedule and clipping. The task itself forms its
+vision, without a classifier of situations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from learner.checkpoint import CheckpointMetadata, RivalMetadata
+from learner.network.softmax_code import SoftmaxCode
+from learner.rivals.networks import Rival, make_rival, rival_config
+from learner.training.asked import Asked
+from learner.training.augmentation import augmented_input
+from learner.training.coupled import SequenceSet
+from learner.training.divergence import backward
+from learner.training.optimization import Hyperparameters
+from learner.training.recipe import Recipe
+from learner.training.sequences import Minibatch, Sequences
+from learner.training.vmdnn_recipe import VMDNNRecipe, code_of
+from proto.config import Config, LearnerConfig, RivalConfig, RivalKind
+from proto.episode import Episode, Image
+from proto.metrics import Stage
+from proto.variables import Question
+
+
+class _ActionObjective:
+    """What both objectives of a rival have in common: they learn actions, and no classes.
+
+    Attributes:
+        code: how the outputs code actions.
+        asked: always empty.
+        classifier: always None.
+    """
+
+    asked: Sequence[Asked] = ()
+    classifier = None
+
+    def __init__(self, network: Rival, code: SoftmaxCode, generator: torch.Generator) -> None:
+        self.code = code
+        self._network = network
+        self._generator = generator
+
+    def _add_gradients(self, minibatch: Minibatch) -> float:
+        """Mean divergence of eq. (5); adds its gradients."""
+        log_outputs, _ = self._network.act(minibatch.seen())
+        return backward(minibatch.divergence(log_outputs))
+
+
+class EndToEndTraining(_ActionObjective):
+    """Objective of the first stage: outputs from augmented images.
+
+    Attributes:
+        parameters: what is trained: everything.
+    """
+
+    def __init__(
+        self, network: Rival, code: SoftmaxCode, config: RivalConfig, generator: torch.Generator
+    ) -> None:
+        """Start without sequences; `generator` draws the augmentation."""
+        super().__init__(network, code, generator)
+        self.parameters = list(network.parameters())
+        self._config = config
+        self._images: list[Image] = []
+        self._codes: list[Tensor] = []
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def add(self, episode: Episode) -> None:
+        """Add a sequence."""
+        self._images.append(episode.images)
+        self._codes.append(torch.from_numpy(self.code.encode(episode.targets)))
+
+    def add_gradients(self, chosen: Tensor) -> float:
+        """Mean divergence of eq. (5), for the sequences with these indices; adds its gradients."""
+        images = [self._images[index] for index in chosen]
+        seen = self._network.see(augmented_input(images, self._config, self._generator))
+        codes = [self._codes[index] for index in chosen]
+        return self._add_gradients(Minibatch.of_all(Sequences.stacked(list(seen), codes)))
+
+
+class RivalCoupledTraining(_ActionObjective):
+    """Objective of the second stage: outputs from mixtures of what the fixed vision sees.
+
+    Attributes:
+        parameters: what is trained: everything but the vision.
+    """
+
+    def __init__(
+        self, network: Rival, code: SoftmaxCode, config: LearnerConfig, generator: torch.Generator
+    ) -> None:
+        """Start without sequences; `generator` draws mixtures and vision noise."""
+        super().__init__(network, code, generator)
+        self.parameters = network.coupled_parameters()
+        self._config = config
+        self._set = SequenceSet(network.see, code, generator)
+
+    def __len__(self) -> int:
+        return len(self._set)
+
+    def add(self, episode: Episode) -> None:
+        """Add a sequence."""
+        self._set.add(episode)
+
+    def add_gradients(self, chosen: Tensor) -> float:
+        """Mean divergence of eq. (5), for the sequences with these indices; adds its gradients."""
+        # VMDNN draws the noise first; published results of both depend on the order
+        mixed = self._set.mixed(chosen, self._config.interpolation)
+        noise = self._set.vision_noise(len(chosen), self._config.vision_noise)
+        return self._add_gradients(Minibatch.of_all(mixed, noise))
+
+
+class RivalRecipe:
+    """The `Recipe` of a rival."""
+
+    publish_every_epochs = None
+    pretraining_variables: Sequence[str] = ()
+
+    def __init__(self, config: Config, kind: RivalKind) -> None:
+        """Make a network with random weights."""
+        self.config = config
+        self.generator = torch.Generator().manual_seed(config.run.seed)
+        self._settings = rival_config(config.comparison, kind)
+        units = self._settings.units
+        self.network = make_rival(kind, units, config.network, config.run.seed)
+        self.rival = RivalMetadata(kind=kind, units=units)
+
+    @property
+    def pretraining_epochs(self) -> int:
+        """Epochs of the first stage."""
+        return self._settings.together_epochs
+
+    @property
+    def coupled_epochs(self) -> int:
+        """Epochs of the second stage."""
+        return self._settings.epochs
+
+    def hyperparameters(self, stage: Stage, epochs: int) -> Hyperparameters:  # noqa: ARG002
+        """Settings of the optimization, the same in both stages."""
+        learner = self.config.learner
+        return Hyperparameters(
+            epochs=epochs,
+            rate=self._settings.rate,
+            schedule=learner.schedule,
+            warmup_epochs=learner.warmup_epochs,
+            batch=learner.batch,
+            clip_norm=learner.clip_norm,
+        )
+
+    def new_objective(
+        self, stage: Stage, episodes: Sequence[Episode]
+    ) -> EndToEndTraining | RivalCoupledTraining:
+        """Objective of a stage; its ranges are those of the episodes."""
+        return self._objective(stage, code_of(episodes, self.config))
+
+    def restored_objective(
+        self, metadata: CheckpointMetadata
+    ) -> EndToEndTraining | RivalCoupledTraining | None:
+        """Objective of a checkpoint, or None if its stage had none yet."""
+        code = metadata.softmax_code()
+        return None if code is None else self._objective(metadata.stage, code)
+
+    def _objective(
+        self, stage: Stage, code: SoftmaxCode
+    ) -> EndToEndTraining | RivalCoupledTraining:
+        if stage is Stage.PRETRAINING:
+            return EndToEndTraining(self.network, code, self._settings, self.generator)
+        return RivalCoupledTraining(self.network, code, self.config.learner, self.generator)
+
+
+def make_recipe(
+    config: Config, rival: RivalKind | None, questions: Sequence[Question] = ()
+) -> Recipe:
+    """The recipe of a rival, or of VMDNN if `rival` is None; only that asks questions."""
+    return VMDNNRecipe(config, questions) if rival is None else RivalRecipe(config, rival)

@@ -1,0 +1,38 @@
+"""Which backends the conformance suite is run on: all built-in ones, or that of `--backend`."""
+
+from __future__ import annotations
+
+import pytest
+
+from actors.simulator import BACKENDS
+
+OPTION = "--backend"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        OPTION,
+        metavar="package.module:Class",
+        help="run the conformance suite on this backend, and nothing else",
+    )
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "backend" in metafunc.fixturenames:
+        chosen = _chosen(metafunc.config)
+        names = sorted(BACKENDS) if chosen is None else [chosen]
+        metafunc.parametrize("backend", names, scope="session")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """With `--backend`, leave out what tests a particular built-in backend."""
+    if _chosen(config) is not None:
+        others = [item for item in items if "backend" not in getattr(item, "fixturenames", ())]
+        config.hook.pytest_deselected(items=others)
+        items[:] = [item for item in items if item not in others]
+
+
+def _chosen(config: pytest.Config) -> str | None:
+    # pytest knows the option only if it is told of this folder on its command line
+    chosen: str | None = config.getoption(OPTION, default=None)
+    return chosen

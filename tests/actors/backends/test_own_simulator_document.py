@@ -1,0 +1,65 @@
+"""docs/your-own-simulator.md: its backend plays episodes, and the suite runs on it."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from actors.simulator import Simulator
+
+ROOT = Path(__file__).parents[3]
+TEXT = (ROOT / "docs" / "your-own-simulator.md").read_text()
+BACKEND = "my_simulators.still:Still"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with the document's backend."""
+    (code,) = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    (tmp_path / "my_simulators").mkdir()
+    (tmp_path / "my_simulators" / "still.py").write_text(code)
+    return tmp_path
+
+
+def call(cwd: Path, path: Path, command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-P", "-m", *command.split()],
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": str(path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_its_backend_is_found_in_the_current_folder_and_plays(folder: Path) -> None:
+    command = f"services.cli evaluate --policy tutor --trials 2 --json --backend {BACKEND}"
+    answer = call(folder, ROOT, command)
+    assert answer.returncode == 0, answer.stderr
+    assert f'"backend": "{BACKEND}"' in answer.stdout
+
+
+def test_the_suite_runs_on_it(folder: Path) -> None:
+    (command,) = re.findall(r"^PYTHONPATH=FOLDER .*-m (.*)$", TEXT, re.MULTILINE)
+    answer = call(ROOT, folder, f"{command} -p no:cacheprovider")
+    lines = answer.stdout.splitlines()
+    assert re.search(r"\d+ failed, \d+ passed, \d+ deselected", lines[-1]), answer.stdout
+    failed = "\n".join(line for line in lines if line.startswith("FAILED"))
+    assert "pushing_the_obstacle" in failed
+    assert "world_frame" not in failed
+    assert "same_episode" not in failed
+
+
+def test_it_lists_every_method_of_the_contract() -> None:
+    listed = re.findall(r"^\| `(\w+)\(", TEXT, re.MULTILINE)
+    assert set(listed) == set(Simulator.__abstractmethods__)
+
+
+def test_the_modules_that_it_names_exist() -> None:
+    for path in re.findall(r"\]\(\.\./([^)]*)\)", TEXT):
+        assert (ROOT / path).is_file(), path

@@ -1,0 +1,77 @@
+"""`import vmdnn` works as docs/python.md says, and notices packages that took our names."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import vmdnn
+from services.cli import main
+
+ROOT = Path(__file__).parents[1]
+BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
+
+
+@pytest.mark.parametrize("number", range(len(BLOCKS)))
+def test_each_block_of_the_page_runs_by_itself(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert len(BLOCKS[number].splitlines()) < 20
+    monkeypatch.chdir(tmp_path)
+    exec(compile(BLOCKS[number], f"docs/python.md, block {number}", "exec"), {})
+
+
+def test_a_policy_of_ones_own_is_found_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "still.py").write_text(BLOCKS[-1])
+    (tmp_path / "poor.py").write_text("class Poor:\n    def begin(self, situation, seed): ...\n")
+    monkeypatch.chdir(tmp_path)
+    command = "evaluate --trials 1 --workers 1 --json --policy"
+    assert main([*command.split(), "still:Still"]) == 0
+    assert '"lenient": {"successes": 0' in capsys.readouterr().out
+    assert main([*command.split(), "poor:Poor"]) == 2
+    assert "it lacks: step" in capsys.readouterr().err
+
+
+def test_everything_public_is_there_and_documented() -> None:
+    for name in vmdnn.__all__:
+        thing = getattr(vmdnn, name)
+        assert name == "__version__" or thing.__doc__, name
+    assert vmdnn.__version__ == version("vmdnn")
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = vmdnn.nothing
+
+
+def test_the_command_needs_no_torch_to_start() -> None:
+    code = "import sys, vmdnn; assert not {'torch', 'sapien', 'numpy'} & sys.modules.keys()"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_a_package_that_took_one_of_our_names_is_noticed(tmp_path: Path) -> None:
+    """As proto-plus does when it is installed after vmdnn: it overwrites `proto/__init__.py`."""
+    for name in ("proto", "sim_assets", "learner", "actors", "services"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_bytes((ROOT / name / "__init__.py").read_bytes())
+    (tmp_path / "vmdnn.py").write_bytes((ROOT / "vmdnn.py").read_bytes())
+    (tmp_path / "proto" / "__init__.py").write_text('"""Marshals of Google\'s clients."""\n')
+    other = tmp_path / "proto_plus-1.0.dist-info"
+    other.mkdir()
+    (other / "METADATA").write_text("Metadata-Version: 2.1\nName: proto-plus\nVersion: 1.0\n")
+    (other / "RECORD").write_text("proto/__init__.py,,\n")
+    (other / "top_level.txt").write_text("proto\n")
+    ended = subprocess.run(
+        [sys.executable, "-c", "import vmdnn"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 1
+    assert "the package 'proto' is not that of vmdnn; proto-plus has replaced it" in ended.stderr
+    assert "environment of its own" in ended.stderr
