@@ -108,7 +108,6 @@ def test_some_packages_are_imported_in_one_place_only(package: str, place: str) 
     assert [name for name in importing if not name.startswith(place)] == []
 
 
-@pytest.mark.xfail(strict=True, reason="the kernels import the network's shapes and the loss")
 def test_kernels_know_nothing_of_the_rest_of_the_learner() -> None:
     foreign = [
         f"{source.name} imports {module}"
