@@ -10,7 +10,7 @@ from typing import Final, Protocol
 
 from rich.console import Console
 
-from services.commands.figures import activity, corrections, failures, time_constants
+from services.commands.figures import activity, corrections, failures, gestures, time_constants
 from services.figures.drawn import Drawn
 from services.figures.style import check_name, save
 
@@ -32,6 +32,7 @@ FIGURES: Final[Mapping[str, FigureCommand]] = {
     "time-constants": time_constants,
     "failures": failures,
     "corrections": corrections,
+    "gestures": gestures,
 }
 
 

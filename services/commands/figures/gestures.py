@@ -1,0 +1,51 @@
+"""`vmdnn figure gestures`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Final
+
+from proto.errors import UserError
+from services.arguments.common import positive
+from services.figures import gestures
+from services.figures.drawn import Drawn
+from sim_assets.gestures.clip import GestureLibrary
+from sim_assets.gestures.drawing import DrawnGestures
+from sim_assets.gestures.videos import GestureVideoError, RecordedGestures
+
+SUMMARY: Final = "contact sheet of the clips in which a person points (Experiment II)"
+TAKES: Final = 10
+"""Takes of a drawn subject, as many as in the paper."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the figure's arguments."""
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument(
+        "--subjects",
+        type=positive,
+        default=8,
+        help="how many drawn subjects to show; of a single one, all takes are shown",
+    )
+    source.add_argument(
+        "--gestures",
+        type=Path,
+        metavar="DIR",
+        help="show the videos of this folder; it holds picture-left/ and picture-right/",
+    )
+
+
+def draw(arguments: argparse.Namespace) -> Drawn:
+    """Draw or read the clips, and put them on a sheet."""
+    rows = gestures.rows_of(_library(arguments))
+    return Drawn(gestures.draw(rows), gestures.numbers(rows), gestures.table(rows))
+
+
+def _library(arguments: argparse.Namespace) -> GestureLibrary:
+    if arguments.gestures is None:
+        return DrawnGestures(arguments.subjects, TAKES)
+    try:
+        return RecordedGestures(arguments.gestures)
+    except GestureVideoError as error:
+        raise UserError(f"--gestures: {error}") from error

@@ -1,0 +1,211 @@
+"""Experiment II: its situations, clips, scene, baselines and options."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import cv2
+import numpy as np
+import pytest
+
+from actors.player import play
+from actors.policies.by_name import make_policy
+from actors.simulator import DARK_SCREEN, make_simulator
+from actors.tasks.registry import make_task
+from proto.config import SimulatorConfig, TaskConfig
+from proto.episode import Kind
+from proto.errors import UserError
+from sim_assets.gestures.drawing import draw_clip
+from sim_assets.gestures.subject import Subject
+
+FIXED = {"indicated_y_m": 0.26, "other_y_m": 0.26, "indicated_yaw_deg": 0.0, "other_yaw_deg": 0.0}
+
+
+def experiment2(**options):
+    return make_task(TaskConfig.model_validate({"name": "experiment2", **options}))
+
+
+TASK = experiment2()
+
+
+def case_of(situation):
+    """Which of the paper's eight cases a situation is of."""
+    names = ("indicated_x_m", "indicated_kind", "other_kind")
+    return tuple(situation[name] for name in names)
+
+
+def clips_of(situations):
+    return {(s["indicated_x_m"], s["subject"], s["take"]) for s in situations}
+
+
+def test_an_episode_has_eight_subtasks_and_begins_with_the_gesture():
+    assert len(TASK.phases) == 148
+    assert len(TASK.phase_names) == 8
+    assert (TASK.phases[:40] == 0).all()
+
+
+def test_the_first_eight_tutored_cases_are_the_papers():
+    cases = TASK.tutored()[:8]
+    assert len({case_of(case) for case in cases}) == 8
+    for case in cases:
+        assert {name: case[name] for name in FIXED} == FIXED
+
+
+def test_tutored_cases_cover_kinds_poses_and_clips_evenly():
+    cases = TASK.tutored()
+    assert len(cases) == 72
+    assert set(Counter(map(case_of, cases)).values()) == {9}
+    poses = Counter((case["indicated_y_m"], case["indicated_yaw_deg"]) for case in cases)
+    others = Counter((case["other_y_m"], case["other_yaw_deg"]) for case in cases)
+    assert len(poses) == len(others) == 9
+    assert set(poses.values()) == set(others.values()) == {8}
+    assert len(clips_of(cases)) == 20
+    for case in cases:
+        TASK.check(case)
+    assert cases == experiment2().tutored()
+
+
+def test_more_poses_give_more_situations_none_of_them_twice():
+    cases = experiment2(poses=18).tutored()
+    without_clip = [tuple(v for k, v in c.items() if k not in {"subject", "take"}) for c in cases]
+    assert len(set(without_clip)) == len(cases) == 144
+
+
+def test_trials_show_new_takes_of_the_tutored_subject():
+    trials = [TASK.sample(seed) for seed in range(200)]
+    assert {trial["subject"] for trial in trials} == {"0"}
+    assert {trial["take"] for trial in trials} == {str(take) for take in range(10, 20)}
+    assert len({case_of(trial) for trial in trials}) == 8
+    assert not clips_of(trials) & clips_of(TASK.tutored())
+    for trial in trials:
+        TASK.check(trial)
+
+
+def test_trials_can_show_new_subjects():
+    task = experiment2(subjects=4, takes=3, trials_show="new-subjects", poses=3)
+    trials = [task.sample(seed) for seed in range(300)]
+    assert {case["subject"] for case in task.tutored()} == set("0123")
+    assert {trial["subject"] for trial in trials} == {str(seed) for seed in range(4, 12)}
+    assert {trial["take"] for trial in trials} == set("012")
+
+
+def test_corners_are_those_of_the_ranges_in_every_case():
+    corners = TASK.corners()
+    assert len(corners) == 8 * 2**4
+    assert {corner["take"] for corner in corners} == {"10"}
+    assert {corner["indicated_y_m"] for corner in corners} == {0.235, 0.285}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"subjects": 0}, "task.subjects = 0 is no whole number of at least 1"),
+        ({"takes": 2.5}, "task.takes = 2.5 is no whole number"),
+        ({"poses": True}, "task.poses = True is no whole number"),
+        ({"trials_show": "all"}, "task.trials_show = 'all': trials of experiment2 show new-takes"),
+        ({"persons": 3}, "task.persons: the task experiment2 has no such option"),
+        ({"gestures": "/nowhere"}, "task.gestures: /nowhere: there is no such folder"),
+        ({"gestures": 7}, "task.gestures = 7 is no name of a folder"),
+        ({"gestures": "g", "takes": 3}, "leave out task.takes"),
+    ],
+)
+def test_wrong_options_are_refused(options, message):
+    with pytest.raises(UserError, match=message):
+        experiment2(**options)
+
+
+@pytest.mark.parametrize(("place", "side"), [("-0.15", "picture-right"), ("0.07", "picture-left")])
+def test_the_screen_shows_the_clip_of_the_indicated_side_and_then_is_dark(place, side):
+    screen = TASK.scene({**TASK.sample(1), "indicated_x_m": place, "take": "12"}).screen
+    np.testing.assert_array_equal(screen.frames, draw_clip(side, Subject.from_seed(0), 12))
+    np.testing.assert_array_equal(screen.frame(39), screen.frames[39])
+    assert (screen.frame(40) == DARK_SCREEN).all()
+    assert screen.size_m == (1.0, 1.0)
+
+
+def test_objects_stand_at_their_places_on_the_table_in_shades_of_their_own():
+    situation = {
+        **TASK.sample(2), "indicated_x_m": "0.07", "indicated_kind": "standing",
+        "indicated_y_m": 0.28, "indicated_yaw_deg": 10.0, "other_kind": "laying",
+    }  # fmt: skip
+    boxes = {box.name: box for box in TASK.scene(situation).boxes}
+    indicated, other = boxes["indicated_object"], boxes["other_object"]
+    assert indicated.pose.position_m == pytest.approx((-0.07, 0.28, 0.075))
+    assert 2 * np.arcsin(indicated.pose.quaternion[3]) == pytest.approx(np.deg2rad(-10.0))
+    assert other.pose.position_m[0] == pytest.approx(0.15)
+    assert indicated.size_m == (0.028, 0.07, 0.15)
+    assert other.size_m == (0.028, 0.15, 0.07)
+    assert indicated.colour != other.colour
+
+
+def test_videos_of_the_users_own_are_tutored_and_tested(tmp_path):
+    for side in ("picture-left", "picture-right"):
+        (tmp_path / side).mkdir()
+        for number in range(2):
+            path = str(tmp_path / side / f"{number}.avi")
+            writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 64))
+            for _ in range(12):
+                writer.write(np.full((64, 64, 3), 100 + 50 * number, dtype=np.uint8))
+            writer.release()
+    task = experiment2(gestures=str(tmp_path), poses=1)
+    assert {case["take"] for case in task.tutored()} == {"0", "1"}
+    trial = {**task.sample(5), "take": "1"}
+    assert trial["subject"] == "recorded"
+    np.testing.assert_allclose(task.scene(trial).screen.frames, 150, atol=4)
+    with pytest.raises(UserError, match="there is no such clip"):
+        TASK.scene(trial)
+
+
+def test_baselines_see_nothing_of_what_they_are_blind_to():
+    situation = {**TASK.sample(4), "indicated_x_m": "0.07"}
+    negative = TASK.baselines["always-negative-x"](situation)
+    assert negative["indicated_x_m"] == "-0.15"
+    for value in ("kind", "y_m", "yaw_deg"):
+        assert negative[f"indicated_{value}"] == situation[f"other_{value}"]
+        assert negative[f"other_{value}"] == situation[f"indicated_{value}"]
+    assert TASK.baselines["always-positive-x"](situation) == situation
+    kinds = TASK.baselines["kind-blind"](situation)
+    assert kinds["indicated_kind"] != situation["indicated_kind"]
+    assert kinds["indicated_y_m"] == situation["indicated_y_m"]
+    middle = TASK.baselines["pose-blind"](situation)
+    assert middle["indicated_y_m"] == pytest.approx(0.26)
+    assert middle["indicated_yaw_deg"] == 0.0
+    assert middle["indicated_kind"] == situation["indicated_kind"]
+    for belief in TASK.baselines.values():
+        TASK.check(belief(situation))
+
+
+@pytest.fixture(scope="module")
+def physics():
+    simulator = make_simulator(SimulatorConfig(render=False))
+    yield simulator
+    simulator.close()
+
+
+def outcome(simulator, policy, situation):
+    played = make_policy(policy, TASK)
+    return play(simulator, TASK, played, situation, seed=1, kind=Kind.TRIAL).outcome
+
+
+@pytest.mark.parametrize("number", range(8))
+def test_the_tutor_lifts_the_indicated_object_in_every_case(physics, number):
+    assert outcome(physics, "tutor", TASK.tutored()[number]).precise
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(128))
+def test_the_tutor_is_right_at_every_corner(physics, number):
+    assert outcome(physics, "tutor", TASK.corners()[number]).precise
+
+
+def test_the_wrong_side_lifts_the_wrong_object(physics):
+    situation = TASK.tutored()[1]
+    assert situation["indicated_x_m"] == "0.07"
+    missed = outcome(physics, "always-negative-x", situation)
+    assert not missed.lenient
+    assert missed.reason == "wrong_object"
+
+
+def test_the_other_kinds_grasp_is_not_strict(physics):
+    for number in (0, 6):
+        assert not outcome(physics, "kind-blind", TASK.tutored()[number]).strict
