@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
+from textwrap import wrap
 from typing import Final
 
 import cv2
@@ -30,6 +31,8 @@ PANEL_HEIGHT: Final = 480
 VIDEO_WIDTH: Final = 2 * PANEL_WIDTH
 VIDEO_HEIGHT: Final = PANEL_HEIGHT
 _LINE: Final = 24
+_LINE_LETTERS: Final = 78
+"""So many letters of the caption fit beside each other."""
 _MARGIN: Final = 12
 _WHITE: Final = (255, 255, 255)
 
@@ -122,7 +125,7 @@ def _caption(episode: Episode, step: int) -> list[str]:
         policy += f" version {episode.policy_version}"
     return [
         f"{episode.task} in {episode.backend}, {episode.kind} by {policy}",
-        situation_text(episode.situation),
+        *wrap(situation_text(episode.situation), _LINE_LETTERS),
         f"step {step + 1} of {episode.steps}, {episode.phase_names[episode.phases[step]]}, "
         f"outcome: {_in_words(episode.outcome)}",
     ]

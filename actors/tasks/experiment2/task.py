@@ -37,7 +37,9 @@ from proto.variables import (
 )
 
 TUTORED_POSES: Final = tuple(
-    (y_m, yaw_deg) for y_m in (0.26, *world.Y_RANGE_M) for yaw_deg in (0.0, *world.YAW_RANGE_DEG)
+    (y_m, yaw_deg)
+    for y_m in (sum(world.Y_RANGE_M) / 2, *world.Y_RANGE_M)
+    for yaw_deg in (0.0, *world.YAW_RANGE_DEG)
 )
 """Y and yaw of tutored objects, the middle of the ranges first."""
 _CLIP_SEED: Final = 17
