@@ -23,7 +23,7 @@ from pydantic_core import ErrorDetails
 from proto.errors import UserError
 from proto.seeds import SEEDS_PER_CASE, TRIALS_BELOW
 from proto.storage import written_whole
-from proto.strict_yaml import WrittenFloat, WrittenInt, load_yaml
+from proto.strict_yaml import WrittenFloat, WrittenInt, dump_yaml, load_yaml
 
 # Strict: a text or a truth value is never taken for a number.
 Switch = Annotated[bool, Field(strict=True)]
@@ -437,7 +437,7 @@ class Config(_Section):
             UserError: it cannot be written there.
         """
         with written_whole(path) as stream:
-            stream.write(yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False).encode())
+            stream.write(dump_yaml(self.model_dump(mode="json")).encode())
 
 
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:

@@ -19,6 +19,9 @@ POLICY_LIMIT: Final = 256 * MEBIBYTE
 Count = Annotated[int, Integer(0, 2**31)]
 Seed = Annotated[int, Integer(0, 2**63 - 1)]
 
+PolicyKey = tuple[str, int]
+"""What identifies a policy: id of its training, and its version."""
+
 
 @message("policy", 1, limit=POLICY_LIMIT + MEBIBYTE)
 @dataclass(frozen=True)

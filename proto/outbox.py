@@ -49,8 +49,9 @@ class Outbox:
 
     A receiver answers with a receipt, or with a refusal, which is final: a refused message is kept
     in a file with the suffix `.refused` and not sent again. A message without an answer is sent
-    again, later each time. Messages that were sent least often go first, the oldest of them first:
-    messages that nobody answers, such as those of another version, do not hold up the others.
+    again, later each time; the first answer after a long silence makes all messages due at once.
+    Messages that were sent least often go first, the oldest of them first: messages that nobody
+    answers, such as those of another version, do not hold up the others.
 
     A file is one line of JSON with key and encoding, followed by the payload. Used by several
     threads.
@@ -82,6 +83,7 @@ class Outbox:
         self._folder = folder
         self._send = send
         self._resend_after_s = resend_after_s
+        self._at_most_s = max(RESEND_AFTER_AT_MOST_S, resend_after_s)
         self._clock = clock
         self._lock = threading.Lock()
         self._last_answer_s = clock()
@@ -154,14 +156,13 @@ class Outbox:
 
     def _patience_s(self, entry: _Entry) -> float:
         """How long to wait for an answer after the last time that a message was sent."""
-        longest_s = max(RESEND_AFTER_AT_MOST_S, self._resend_after_s)
-        return min(self._resend_after_s * 2.0 ** max(entry.sends - 1, 0), longest_s)
+        return min(self._resend_after_s * 2.0 ** max(entry.sends - 1, 0), self._at_most_s)
 
     def _answered(self, name: str) -> _Entry | None:
         """Take a message out whose answer has come."""
         with self._lock:
             now_s = self._clock()
-            if now_s - self._last_answer_s >= self._resend_after_s:  # the receiver was away
+            if now_s - self._last_answer_s >= self._at_most_s:  # the receiver was away
                 for entry in self._entries.values():
                     entry.sent_at_s = float("-inf")
             self._last_answer_s = now_s

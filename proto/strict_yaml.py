@@ -49,6 +49,24 @@ def load_yaml(text: str) -> Any:
         raise yaml.YAMLError("it is nested too deeply") from error
 
 
+def dump_yaml(value: Any) -> str:
+    """Write a value so that `load_yaml` and readers of YAML 1.1 read the same; keys in order."""
+    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False)
+    return text
+
+
+class _Dumper(yaml.SafeDumper):
+    pass
+
+
+def _represent_text(dumper: _Dumper, text: str) -> yaml.ScalarNode:
+    ambiguous = any(pattern.fullmatch(text) for pattern in _RESOLVERS.values())
+    return dumper.represent_scalar(f"{_PREFIX}str", text, style="'" if ambiguous else None)
+
+
+_Dumper.add_representer(str, _represent_text)
+
+
 class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 

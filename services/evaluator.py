@@ -16,6 +16,7 @@ from proto.lifecycle import Lifecycle
 from proto.membership import alone_in_run, membership
 from proto.messages import (
     EpisodeFailed,
+    PolicyKey,
     PolicyVersion,
     Receipt,
     Rollout,
@@ -33,9 +34,6 @@ WAITING: Final = 64
 """Messages that may wait to be handled; more are dropped, and sent again by their actors."""
 IDLE_S: Final = 0.5
 """How often to look whether it should stop, while no rollout arrives."""
-
-PolicyKey = tuple[str, int]
-"""Id of a policy's training, and its version."""
 
 
 class Evaluator:

@@ -326,10 +326,7 @@ Pass<Real>::Pass(const CoreProblem<Real>& problem, Arena& arena)
       outputs_(padded_to_tiles(problem.values * problem.softmax_units)) {
   describe();
   form_groups();
-  arena.measure();
-  take_memory(arena);
-  arena.reserve();
-  take_memory(arena);
+  arena.allocate([&] { take_memory(arena); });
   pack_weights();
 }
 

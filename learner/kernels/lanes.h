@@ -112,10 +112,24 @@ class Arena {
  public:
   ~Arena() { std::free(memory_); }
 
-  // Starts counting: until `reserve`, `take` returns no usable memory but adds up the sizes.
-  void measure() { used_ = 0; }
+  // Provides memory for everything that take_memory() gets from `take`. It is called twice: first to
+  // count, when `take` returns no usable memory. Memory taken earlier becomes invalid.
+  template <typename Function>
+  void allocate(const Function& take_memory) {
+    used_ = 0;
+    take_memory();
+    reserve();
+    take_memory();
+  }
 
-  // Provides the memory that was counted; earlier results of `take` become invalid.
+  template <typename Value>
+  Value* take(std::size_t count) {
+    const auto address = reinterpret_cast<std::uintptr_t>(memory_) + used_;
+    used_ += (count * sizeof(Value) + kLine - 1) / kLine * kLine;
+    return reinterpret_cast<Value*>(address);
+  }
+
+ private:
   void reserve() {
     const std::size_t bytes = used_;
     used_ = 0;
@@ -132,14 +146,6 @@ class Arena {
 #endif
   }
 
-  template <typename Value>
-  Value* take(std::size_t count) {
-    const auto address = reinterpret_cast<std::uintptr_t>(memory_) + used_;
-    used_ += (count * sizeof(Value) + kLine - 1) / kLine * kLine;
-    return reinterpret_cast<Value*>(address);
-  }
-
- private:
   static constexpr std::size_t kLine = 64;
   static constexpr std::size_t kPage = std::size_t(1) << 21;
   char* memory_ = nullptr;

@@ -248,10 +248,7 @@ MapsPass<Real>::MapsPass(const MapsProblem<Real>& problem, Arena& arena) : probl
             problem.kernel_width,
             problem.stride};
   if (problem.by_below != nullptr) describe_phases();
-  arena.measure();
-  take_memory(arena);
-  arena.reserve();
-  take_memory(arena);
+  arena.allocate([&] { take_memory(arena); });
   pack_weights();
 }
 

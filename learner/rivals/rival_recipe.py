@@ -17,7 +17,7 @@ from learner.network.softmax_code import SoftmaxCode
 from learner.rivals.networks import Rival, make_rival, rival_config
 from learner.training.asked import Asked
 from learner.training.augmentation import augmented_input
-from learner.training.coupled import SequenceSet
+from learner.training.coupled import CoupledObjective
 from learner.training.divergence import backward
 from learner.training.optimization import Hyperparameters
 from learner.training.recipe import Recipe
@@ -29,42 +29,27 @@ from proto.metrics import Stage
 from proto.variables import Question
 
 
-class _ActionObjective:
-    """What both objectives of a rival have in common: they learn actions, and no classes.
+class EndToEndTraining:
+    """Objective of the first stage: outputs from augmented images.
 
     Attributes:
         code: how the outputs code actions.
         asked: always empty.
         classifier: always None.
+        parameters: what is trained: everything.
     """
 
     asked: Sequence[Asked] = ()
     classifier = None
 
-    def __init__(self, network: Rival, code: SoftmaxCode, generator: torch.Generator) -> None:
-        self.code = code
-        self._network = network
-        self._generator = generator
-
-    def _add_gradients(self, minibatch: Minibatch) -> float:
-        """Mean divergence of eq. (5); adds its gradients."""
-        log_outputs, _ = self._network.act(minibatch.seen())
-        return backward(minibatch.divergence(log_outputs))
-
-
-class EndToEndTraining(_ActionObjective):
-    """Objective of the first stage: outputs from augmented images.
-
-    Attributes:
-        parameters: what is trained: everything.
-    """
-
     def __init__(
         self, network: Rival, code: SoftmaxCode, config: RivalConfig, generator: torch.Generator
     ) -> None:
         """Start without sequences; `generator` draws the augmentation."""
-        super().__init__(network, code, generator)
+        self.code = code
         self.parameters = list(network.parameters())
+        self._network = network
+        self._generator = generator
         self._config = config
         self._images: list[Image] = []
         self._codes: list[Tensor] = []
@@ -82,10 +67,11 @@ class EndToEndTraining(_ActionObjective):
         images = [self._images[index] for index in chosen]
         seen = self._network.see(augmented_input(images, self._config, self._generator))
         codes = [self._codes[index] for index in chosen]
-        return self._add_gradients(Minibatch.of_all(Sequences.stacked(list(seen), codes)))
+        minibatch = Minibatch.of_all(Sequences.stacked(list(seen), codes))
+        return _add_gradients(self._network, minibatch)
 
 
-class RivalCoupledTraining(_ActionObjective):
+class RivalCoupledTraining(CoupledObjective):
     """Objective of the second stage: outputs from mixtures of what the fixed vision sees.
 
     Attributes:
@@ -96,24 +82,23 @@ class RivalCoupledTraining(_ActionObjective):
         self, network: Rival, code: SoftmaxCode, config: LearnerConfig, generator: torch.Generator
     ) -> None:
         """Start without sequences; `generator` draws mixtures and vision noise."""
-        super().__init__(network, code, generator)
+        super().__init__(network.see, code, generator)
         self.parameters = network.coupled_parameters()
+        self._network = network
         self._config = config
-        self._set = SequenceSet(network.see, code, generator)
-
-    def __len__(self) -> int:
-        return len(self._set)
-
-    def add(self, episode: Episode) -> None:
-        """Add a sequence."""
-        self._set.add(episode)
 
     def add_gradients(self, chosen: Tensor) -> float:
         """Mean divergence of eq. (5), for the sequences with these indices; adds its gradients."""
         # VMDNN draws the noise first; published results of both depend on the order
-        mixed = self._set.mixed(chosen, self._config.interpolation)
-        noise = self._set.vision_noise(len(chosen), self._config.vision_noise)
-        return self._add_gradients(Minibatch.of_all(mixed, noise))
+        mixed = self.mixed(chosen, self._config.interpolation)
+        noise = self.vision_noise(len(chosen), self._config.vision_noise)
+        return _add_gradients(self._network, Minibatch.of_all(mixed, noise))
+
+
+def _add_gradients(network: Rival, minibatch: Minibatch) -> float:
+    """Mean divergence of eq. (5); adds its gradients."""
+    log_outputs, _ = network.act(minibatch.seen())
+    return backward(minibatch.divergence(log_outputs))
 
 
 class RivalRecipe:

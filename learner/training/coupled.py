@@ -33,7 +33,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Stacked:
-    """All sequences of a `SequenceSet` side by side.
+    """All sequences side by side.
 
     Attributes:
         sequences: what is seen, and the teacher's outputs.
@@ -48,12 +48,17 @@ class _Stacked:
     grid: NeighbourGrid
 
 
-class SequenceSet:
-    """Tutored sequences as a fixed vision sees them, with noise and interpolation.
+class CoupledObjective:
+    """What objectives of coupled training have in common: sequences as a fixed vision sees them.
 
     Attributes:
-        code: how the outputs code actions.
+        code: how the outputs code actions; fixed, so that all policies of a run agree.
+        asked: always empty.
+        classifier: always None.
     """
+
+    asked: Sequence[Asked] = ()
+    classifier = None
 
     def __init__(
         self, see: Callable[[Tensor], Tensor], code: SoftmaxCode, generator: torch.Generator
@@ -111,19 +116,6 @@ class SequenceSet:
         noise = torch.randn(count, len(deviations), generator=self._generator)
         return amplitude * deviations * noise
 
-    def mean_errors(self, act: Callable[[Tensor], Tensor]) -> NDArray[np.float64]:
-        """(11,) mean distance of decoded outputs from the targets, over all sequences.
-
-        Args:
-            act: logarithms of the outputs (B, T, 11, softmax units) for V_S (B, T, units).
-        """
-        errors = []
-        with torch.no_grad():
-            for seen, targets in zip(self._seen, self._targets, strict=True):
-                outputs = act(seen[None])[0].exp().numpy()
-                errors.append(np.abs(self.code.decode(outputs) - targets))
-        return np.asarray(np.concatenate(errors).mean(0))
-
     def _all(self) -> _Stacked:
         if self._stacked is None:
             sequences = Sequences.stacked(self._seen, self._codes)
@@ -148,18 +140,12 @@ class SequenceSet:
                 )
 
 
-class CoupledTraining:
-    """Objective of coupled training: eq. (5) on tutored sequences and mixtures of them.
+class CoupledTraining(CoupledObjective):
+    """Objective of VMDNN in coupled training: eq. (5) on tutored sequences and mixtures of them.
 
     Attributes:
-        code: how the outputs code actions; fixed, so that all policies of a run agree.
-        asked: always empty.
-        classifier: always None.
         parameters: what is trained: everything but the vision.
     """
-
-    asked: Sequence[Asked] = ()
-    classifier = None
 
     def __init__(
         self, network: VMDNN, code: SoftmaxCode, config: LearnerConfig, generator: torch.Generator
@@ -172,27 +158,19 @@ class CoupledTraining:
             config: amplitude of the vision noise, and how often sequences are mixed.
             generator: draws both.
         """
-        self.code = code
+        super().__init__(network.see, code, generator)
         self.parameters = network.coupled_parameters()
         self._network = network
         self._config = config
-        self._set = SequenceSet(network.see, code, generator)
-
-    def __len__(self) -> int:
-        return len(self._set)
-
-    def add(self, episode: Episode) -> None:
-        """Add a sequence."""
-        self._set.add(episode)
 
     def add_gradients(self, chosen: Tensor) -> float:
         """Mean divergence of eq. (5), for the sequences with these indices; adds its gradients."""
         amplitude, share = self._config.vision_noise, self._config.interpolation
-        noise = self._set.vision_noise(len(chosen), amplitude) if amplitude else None
+        noise = self.vision_noise(len(chosen), amplitude) if amplitude else None
         if share:
-            minibatch = Minibatch.of_all(self._set.mixed(chosen, share), noise)
+            minibatch = Minibatch.of_all(self.mixed(chosen, share), noise)
         else:
-            minibatch = Minibatch(self._set.sequences(), chosen, shift=noise)
+            minibatch = Minibatch(self.sequences(), chosen, shift=noise)
         return add_gradients(self._network, minibatch)
 
     def mean_errors(self) -> NDArray[np.float64]:
@@ -200,4 +178,9 @@ class CoupledTraining:
 
         The network sees the tutor's images, not those that its own actions would lead to.
         """
-        return self._set.mean_errors(self._network.act)
+        errors = []
+        with torch.no_grad():
+            for seen, targets in zip(self._seen, self._targets, strict=True):
+                outputs = self._network.act(seen[None])[0].exp().numpy()
+                errors.append(np.abs(self.code.decode(outputs) - targets))
+        return np.asarray(np.concatenate(errors).mean(0))

@@ -11,12 +11,9 @@ from learner.tutoring.failures import Failures, Shown
 from proto.config import Config
 from proto.episode import Kind
 from proto.leases import Leases
-from proto.messages import Correction, EpisodeFailed, TutoringRequest, Verdict
+from proto.messages import Correction, EpisodeFailed, PolicyKey, TutoringRequest, Verdict
 from proto.seeds import CORRECTIONS
 from proto.variables import Question, Situation
-
-PolicyKey = tuple[str, int]
-"""Id of a policy's training, and its version."""
 
 
 class Situations(Protocol):

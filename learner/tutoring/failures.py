@@ -14,21 +14,27 @@ Item = TypeVar("Item", bound=Hashable)
 
 
 class Shown(Protocol):
-    """What tells one sequence from another: an episode, its summary, or a report that it failed.
-
-    The attributes are those of `Episode`.
-    """
+    """What tells one sequence from another: an episode, its summary, or a report that it failed."""
 
     @property
-    def kind(self) -> Kind: ...  # noqa: D102
+    def kind(self) -> Kind:
+        """Why it was played."""
+
     @property
-    def task(self) -> str: ...  # noqa: D102
+    def task(self) -> str:
+        """Name of the task."""
+
     @property
-    def seed(self) -> int: ...  # noqa: D102
+    def seed(self) -> int:
+        """Seed of the episode."""
+
     @property
-    def policy_version(self) -> int: ...  # noqa: D102
+    def training(self) -> str:
+        """Id of the training that the policy comes from, empty for the tutor."""
+
     @property
-    def training(self) -> str: ...  # noqa: D102
+    def policy_version(self) -> int:
+        """Version of the policy, 0 for the tutor."""
 
 
 class Failures(Generic[Item]):

@@ -7,17 +7,16 @@ are not played again.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from learner.checkpoint import load_checkpoint
 from learner.training.schedule import RoundSchedule
 from proto.config import Config, load_config
-from proto.episode import Outcome
 from proto.errors import UserError
 from proto.metrics import Stage
-from services.trials.trial_playing import LoggedPolicy, play_missing_trials
+from services.trials.trial_playing import LoggedPolicy
 
 
 @dataclass(frozen=True)
@@ -38,10 +37,14 @@ class RoundPolicy:
     sequences: int
     file: Path
 
-    @property
-    def digest(self) -> str:
-        """Distinguishes it from a policy of this version in a run that was started anew."""
-        return hashlib.sha256(self.file.read_bytes()).hexdigest()[:16]
+    def logged(self) -> LoggedPolicy:
+        """The policy as the trial log names it.
+
+        A digest of the file stands for the training, so that trials of a run that was started anew
+        are counted separately.
+        """
+        digest = hashlib.sha256(self.file.read_bytes()).hexdigest()[:16]
+        return LoggedPolicy(self.file, digest, self.version)
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,11 @@ class Run:
     folder: Path
     config: Config
     policies: Sequence[RoundPolicy]
+
+    @property
+    def trial_log(self) -> Path:
+        """File of the counted trials."""
+        return self.folder / "evaluation" / "round_trials.jsonl"
 
 
 def open_run(folder: Path) -> Run:
@@ -88,33 +96,3 @@ def open_run(folder: Path) -> Run:
             " of coupled training before any corrections; let the run go on to there"
         )
     return Run(folder, config, policies)
-
-
-def play_trials(
-    run: Run,
-    policy: RoundPolicy,
-    trials: int,
-    seed: int,
-    *,
-    workers: int,
-    on_trial: Callable[[], None],
-) -> list[Outcome]:
-    """Play the trials of a policy that were not counted yet; the outcomes of all of them.
-
-    Args:
-        run: the run.
-        policy: one of its policies.
-        trials: number of trials; the situations are the same for every policy.
-        seed: seed of the first.
-        workers: processes to play in.
-        on_trial: called for each trial, also for those counted before.
-    """
-    return play_missing_trials(
-        run.folder / "evaluation" / "round_trials.jsonl",
-        LoggedPolicy(policy.file, policy.digest, policy.version),
-        run.config,
-        trials,
-        seed,
-        workers=workers,
-        on_trial=on_trial,
-    )

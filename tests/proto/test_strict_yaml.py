@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
-from proto.strict_yaml import load_yaml
+from proto.strict_yaml import dump_yaml, load_yaml
 
 
 @pytest.mark.parametrize(
@@ -63,5 +63,9 @@ def test_what_is_refused(text: str, said: str) -> None:
         lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
     )
 )
+@example("0E0")
+@example({"1e3": "0o7"})
 def test_what_is_dumped_is_read_back(value: Any) -> None:
-    assert load_yaml(yaml.safe_dump(value)) == value
+    text = dump_yaml(value)
+    assert load_yaml(text) == value
+    assert yaml.safe_load(text) == value, "YAML 1.1 reads the same"

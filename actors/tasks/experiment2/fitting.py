@@ -39,6 +39,7 @@ from actors.tasks.experiment2.postures import (
 from actors.tasks.experiment2.setting import KINDS, PlacedObject, other_place
 from actors.tasks.experiment2.world import START, TABLE_DROP_M, Y_RANGE_M, YAW_RANGE_DEG
 from proto.body import ARM
+from proto.storage import written_whole
 from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
 
 Array = NDArray[np.float64]
@@ -283,8 +284,8 @@ def fit_key_postures() -> KeyPostures:
 def main() -> None:
     """Fit all key postures and write them where `load_key_postures` finds them."""
     text = fit_key_postures().to_json()
-    with as_file(FITTED) as path:
-        path.write_text(text)
+    with as_file(FITTED) as path, written_whole(path) as stream:
+        stream.write(text.encode())
     print(f"wrote {FITTED}")
 
 

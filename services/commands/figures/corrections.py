@@ -16,9 +16,9 @@ from services.figures import corrections
 from services.figures.corrections import Curve
 from services.figures.drawn import Drawn
 from services.terminal.progress import progress_bar
-from services.trials import round_trials
-from services.trials.round_trials import Run
+from services.trials.round_trials import Run, open_run
 from services.trials.success import Tally
+from services.trials.trial_playing import play_missing_trials
 
 SUMMARY: Final = "success against the number of tutored cases, as policies are corrected"
 
@@ -45,7 +45,7 @@ def draw(arguments: argparse.Namespace) -> Drawn:
             f"--seed {arguments.seed}: with seeds of {TRIALS_BELOW} and more a run may have been"
             " tutored; take a smaller one"
         )
-    runs = [round_trials.open_run(folder) for folder in arguments.runs]
+    runs = [open_run(folder) for folder in arguments.runs]
     try:
         curves = [_curve(run, arguments) for run in runs]
     except KeyboardInterrupt:
@@ -70,9 +70,10 @@ def _curve(run: Run, arguments: argparse.Namespace) -> Curve:
     for policy in run.policies:
         label = f"{run.config.run.name}, policy {policy.version}"
         with progress_bar(label, arguments.trials) as advance:
-            outcomes = round_trials.play_trials(
-                run,
-                policy,
+            outcomes = play_missing_trials(
+                run.trial_log,
+                policy.logged(),
+                run.config,
                 arguments.trials,
                 arguments.seed,
                 workers=arguments.workers,

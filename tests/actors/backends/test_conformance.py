@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from actors.backends import light
+from actors.backends.eye import SKY
 from actors.simulator import (
     DARK_SCREEN,
     ROBOT,
@@ -325,69 +326,59 @@ def test_a_surface_is_as_bright_as_the_shared_light_says(seeing, normal, quatern
     assert picture[row, column] == pytest.approx(255 * expected ** (1 / light.GAMMA), abs=1.5)
 
 
-QUARTERS = np.kron(np.array([[40, 90], [140, 190]]), np.ones((48, 48))).astype(np.uint8)
-"""A frame whose quarters have other grey levels."""
-SCREEN = Screen((1.0, 0.8), Pose((0.05, 1.2, 0.4)), np.stack([QUARTERS, 255 - QUARTERS]))
+SCREEN_CENTRE = (-0.034, 0.5, 0.24)
+"""In the middle of the eye image when the neck is at zero."""
 
 
-def looking_at_screen(simulator, screen=SCREEN):
-    start = targets(neck=(25.0, -2.0))
-    simulator.reset(replace(scene(TABLE, start=start), screen=screen))
-    return start
+def screen_scene(*frames, boxes=(TABLE,)) -> Scene:
+    """A scene with a screen that the eye looks at."""
+    screen = Screen((0.16, 0.12), Pose(SCREEN_CENTRE), np.array(frames, dtype=np.uint8))
+    return replace(scene(*boxes, start=targets(neck=(0.0, 0.0))), screen=screen)
 
 
-def quarters_seen(simulator):
-    """Grey levels in the middle of the screen's quarters, (2, 2), upper left first."""
-    x, y, z = SCREEN.pose.position_m
-    return np.array(
-        [
-            [grey_at(simulator, (x + across, y, z + up)) for across in (-0.25, 0.25)]
-            for up in (0.2, -0.2)
-        ]
-    )
+def plain(grey) -> np.ndarray:
+    return np.full((12, 16), grey)
 
 
-def test_a_screen_shows_its_frames_upright_and_as_bright_as_they_are(seeing):
-    start = looking_at_screen(seeing)
-    np.testing.assert_allclose(quarters_seen(seeing), [[40, 90], [140, 190]], atol=1.0)
-    seeing.step(start)
-    np.testing.assert_allclose(quarters_seen(seeing), [[215, 165], [115, 65]], atol=1.0)
+def test_a_screen_shows_one_frame_in_each_control_step_and_then_is_dark(seeing):
+    seeing.reset(screen_scene(plain(40), plain(120), plain(200)))
+    shown = []
+    for _ in range(5):
+        shown.append(grey_at(seeing, SCREEN_CENTRE))
+        seeing.step(targets(neck=(0.0, 0.0)))
+    assert shown == pytest.approx([40, 120, 200, DARK_SCREEN, DARK_SCREEN], abs=1)
+    seeing.reset(screen_scene(plain(90)))
+    assert grey_at(seeing, SCREEN_CENTRE) == pytest.approx(90, abs=1)
+    seeing.reset(scene(TABLE, start=targets(neck=(0.0, 0.0))))
+    assert grey_at(seeing, SCREEN_CENTRE) == pytest.approx(SKY, abs=1), "the screen is gone"
 
 
-def test_a_screen_has_the_size_and_place_that_the_scene_says(seeing):
-    looking_at_screen(seeing, replace(SCREEN, frames=np.full((1, 8, 8), 250, dtype=np.uint8)))
-    x, y, z = SCREEN.pose.position_m
-    for across, up in ((0.47, 0.0), (-0.47, 0.0), (0.0, 0.37), (0.0, -0.37)):
-        assert grey_at(seeing, (x + across, y, z + up)) > 240.0
-        assert grey_at(seeing, (x + across * 1.13, y, z + up * 1.16)) < 150.0
-
-
-def test_a_screen_is_dark_after_its_last_frame(seeing):
-    start = looking_at_screen(seeing)
-    for _ in range(2):
-        seeing.step(start)
-    np.testing.assert_allclose(quarters_seen(seeing), DARK_SCREEN, atol=1.0)
-
-
-def test_a_screen_begins_anew_with_the_scene_and_goes_with_it(seeing):
-    start = looking_at_screen(seeing)
-    seeing.step(start)
-    looking_at_screen(seeing)
-    np.testing.assert_allclose(quarters_seen(seeing), [[40, 90], [140, 190]], atol=1.0)
-    seeing.reset(scene(TABLE, start=start))
-    assert np.ptp(quarters_seen(seeing)) < 2.0
+def test_a_screen_stands_upright_with_its_left_edge_at_minus_x(seeing):
+    frame = np.block([[plain(50), plain(100)], [plain(150), plain(200)]])
+    seeing.reset(screen_scene(frame))
+    x, y, z = SCREEN_CENTRE
+    corners = [(x + dx, y, z + dz) for dz in (0.03, -0.03) for dx in (-0.04, 0.04)]
+    seen = [grey_at(seeing, corner) for corner in corners]
+    assert seen == pytest.approx([50, 100, 150, 200], abs=1)
 
 
 def test_a_recorded_step_of_a_screen_can_be_shown_again(seeing):
-    looking_at_screen(seeing)
-    seeing.show(seeing.joints_deg(), {}, 1)
-    np.testing.assert_allclose(quarters_seen(seeing), [[215, 165], [115, 65]], atol=1.0)
+    seeing.reset(screen_scene(plain(40), plain(120), plain(200)))
+    seeing.show(seeing.joints_deg(), {}, 2)
+    assert grey_at(seeing, SCREEN_CENTRE) == pytest.approx(200, abs=1)
 
 
-def test_nothing_is_rendered_for_a_screen_that_nobody_sees(blind):
-    start = looking_at_screen(blind)
-    blind.step(start)
-    assert (blind.observe(Crop()).image == 0).all()
+def test_nothing_touches_a_screen(blind):
+    x, y, z = SCREEN_CENTRE
+    above = Pose((x, y, z + 0.15))
+    falling = Box("falling", (0.04, 0.04, 0.04), above, (1, 1, 1), mass_kg=0.1)
+    heights_m = []
+    for start in (screen_scene(plain(40), boxes=(falling,)), scene(falling)):
+        blind.reset(start)
+        for _ in range(4):
+            blind.step(start.start)
+        heights_m.append(blind.bodies()["falling"].position_m[2])
+    assert heights_m[0] == heights_m[1] < z - 0.1
 
 
 def share_of(picture, red, green, blue):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import subprocess
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.simulator import Simulator
+from actors.simulator import Simulator, load_backend
 
 ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "your-own-simulator.md").read_text()
@@ -55,9 +56,25 @@ def test_the_suite_runs_on_it(folder: Path) -> None:
     assert "same_episode" not in failed
 
 
-def test_it_lists_every_method_of_the_contract() -> None:
-    listed = re.findall(r"^\| `(\w+)\(", TEXT, re.MULTILINE)
-    assert set(listed) == set(Simulator.__abstractmethods__)
+def parameters(cls: type, method: str) -> list[str]:
+    names = inspect.signature(getattr(cls, method)).parameters
+    return [name for name in names if name != "self"]
+
+
+def test_it_lists_every_method_of_the_contract_with_its_parameters() -> None:
+    rows = re.findall(r"^\| `(\w+)\((.*?)\)`", TEXT, re.MULTILINE)
+    listed = {method: [name for name in names.split(", ") if name] for method, names in rows}
+    methods = Simulator.__abstractmethods__
+    assert listed == {method: parameters(Simulator, method) for method in methods}
+
+
+def test_its_backend_has_the_parameters_of_the_contract(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(folder)
+    still = load_backend(BACKEND)
+    for method in Simulator.__abstractmethods__:
+        assert parameters(still, method) == parameters(Simulator, method)
 
 
 def test_the_modules_that_it_names_exist() -> None:

@@ -75,9 +75,9 @@ def test_the_policy_at_the_end_of_each_round_is_tested_once(
     assert len(book.read_bytes().splitlines()) == 6
 
     # another training of the same name has trials of its own
-    before = open_run(run).policies[0].digest
+    before = open_run(run).policies[0].logged()
     shutil.copy(policy_file(run, 3), policy_file(run, 2))
-    assert open_run(run).policies[0].digest != before
+    assert open_run(run).policies[0].logged() != before
 
 
 def test_what_cannot_be_drawn_is_named(
