@@ -121,7 +121,10 @@ class Experiment2(Task):
         try:
             clip = self._clips.library.clip(setting.side, setting.subject, setting.take)
         except ValueError as error:
-            raise UserError(f"{self.name}: there is no such clip: {error}") from error
+            raise UserError(
+                f"{self.name}: there is no such clip: {error}. Videos of your own are found with"
+                f" --set task.name={self.name} --set task.gestures=FOLDER."
+            ) from error
         return world.scene(setting, clip)
 
     def plan(self, situation: Situation) -> Array:
