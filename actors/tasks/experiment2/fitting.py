@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.kinematics import Arm, ArmPose, ClearanceBox
-from actors.motion import travel
+from actors.motion import interpolate_postures
 from actors.posture_fitting import (
     ANGLE,
     LIMIT,
@@ -252,7 +252,7 @@ class FamilyFitter:
         def residual(posture: Array, i: int) -> Array:
             box = self._boxes[corners[i]]
             parts = []
-            for between in travel([self._start, posture, ends[i]], shares):
+            for between in interpolate_postures([self._start, posture, ends[i]], shares):
                 pose = self._arm.pose(between)
                 parts += [
                     shortfall(self._distances(pose, box).min(), PASSING_MARGIN_M),
