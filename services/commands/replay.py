@@ -15,12 +15,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
     parser.add_argument("file", type=Path, help="recorded episode, whole or recovered")
     parser.add_argument("--out", type=Path, required=True, help="MP4 file to write")
-    parser.add_argument("--fps", type=float, help="steps per second; without it, as fast as it was")
-    parser.add_argument("--backend", help="simulator that renders; without it, the recorded one")
+    parser.add_argument("--fps", type=float, help="steps per second; without it, real time")
+    parser.add_argument(
+        "--backend", help="simulator that renders; without it, the one that played the episode"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Render the episode."""
+    """Render the episode as a video."""
     episode = read_episode(arguments.file, partial=True)
     config = SimulatorConfig(backend=arguments.backend or episode.backend)
     with progress_bar("rendering", episode.steps) as advance:
