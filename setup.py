@@ -1,4 +1,4 @@
-"""Compiles the C++ kernels when the package is installed; all else is in pyproject.toml."""
+"""Compiles the C++ kernels when the package is built; pyproject.toml has everything else."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from pathlib import Path
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-# The package is not installed yet. What is imported here needs nothing but Python.
+# The package is not installed yet. This module of it needs only Python's standard library.
 sys.path.insert(0, str(Path(__file__).parent))
 from learner.kernels import build as builder
 
 
 class CompileKernel(build_ext):
-    """Compiles with `learner.kernels.build`; without a compiler the package works all the same."""
+    """Compiles with `learner.kernels.build`; without a compiler the package works, but slower."""
 
     def get_ext_filename(self, fullname: str) -> str:
-        """The library's own name in place of the module's."""
+        """Return the file name of the library, which differs from the module's name."""
         *packages, _ = fullname.split(".")
         return str(Path(*packages, builder.library_name()))
 
     def build_extension(self, ext: Extension) -> None:
-        """Compile it, or say why not."""
+        """Compile the library; warn if it cannot be compiled."""
         try:
             builder.compile_into(Path(self.get_ext_fullpath(ext.name)).parent)
         except builder.NotCompiledError as error:

@@ -1,4 +1,4 @@
-"""vmdnn in Python: simulators, tasks, policies, recordings, training and evaluation.
+"""The Python interface: simulators, tasks, policies, recordings, training and evaluation.
 
     import vmdnn
 
@@ -8,8 +8,8 @@
     episode = vmdnn.play(simulator, task, policy, seed=7)
     print(episode.outcome)
 
-`docs/python.md` shows each function at work. `Task`, `Policy` and `Simulator` are what a class of
-one's own has to be; `UserError` is what every function raises on bad input.
+`docs/python.md` shows an example of each function. Your own tasks, policies and simulators
+implement `Task`, `Policy` and `Simulator`. Every function raises `UserError` for bad input.
 """
 
 from __future__ import annotations
@@ -62,14 +62,14 @@ _CLASSES: Final = {
     "Task": "actors.tasks.contract",
     "UserError": "proto.errors",
 }
-"""Classes that are imported when they are first used: `vmdnn hub` needs no simulator."""
+"""Classes that are imported on first use, so that `vmdnn hub` does not import a simulator."""
 
 
 def _check_packages() -> None:
-    """Refuse to start where another distribution has replaced one of our packages.
+    """Raise ImportError if another distribution has replaced one of our packages.
 
-    The packages have common names: `proto` is also the module of proto-plus, which Google's cloud
-    clients use. Whichever is installed last overwrites the other.
+    The packages have common names. `proto`, for example, is also the module of proto-plus, which
+    Google's cloud clients use. The distribution that is installed last overwrites the other.
     """
     for name in _PACKAGES:
         file = Path(__file__).parent / name / "__init__.py"
@@ -112,11 +112,11 @@ def load_config(source: str | Path | None = None, overrides: Sequence[str] = ())
 
 
 def make_task(name: str = "experiment1", **options: Any) -> Task:
-    """Make a task: a built-in one by name, or one of your own as `package.module:Class`.
+    """Make a task.
 
     Args:
-        name: the task.
-        options: what else stands in the section `task` of a configuration, such as
+        name: name of a built-in task, or your own class as `package.module:Class`.
+        options: the other keys of the section `task` of a configuration, such as
             attention="fixed".
     """
     from actors.tasks.registry import make_task as make  # noqa: PLC0415
@@ -126,9 +126,12 @@ def make_task(name: str = "experiment1", **options: Any) -> Task:
 
 
 def make_simulator(backend: str = "sapien", *, render: bool = True) -> Simulator:
-    """Make a simulator: a built-in one by name, or one of your own as `package.module:Class`.
+    """Make a simulator.
 
-    Without `render` no graphics driver is needed and every picture is black.
+    Args:
+        backend: name of a built-in simulator, or your own class as `package.module:Class`.
+        render: render pictures. Without it every picture is black, and no graphics driver is
+            needed.
     """
     from actors.simulator import make_simulator as make  # noqa: PLC0415
     from proto.config import SimulatorConfig  # noqa: PLC0415
@@ -137,11 +140,11 @@ def make_simulator(backend: str = "sapien", *, render: bool = True) -> Simulator
 
 
 def make_policy(name: str | Path, task: Task) -> Policy:
-    """Load a policy that plays a task.
+    """Make a policy that plays a task.
 
     Args:
-        name: `tutor`, a baseline of the task, `pretrained:NAME`, the path of a checkpoint, or a
-            class of your own as `package.module:Class`.
+        name: `tutor`, a baseline of the task, `pretrained:NAME`, the path of a checkpoint, or your
+            own class as `package.module:Class`.
         task: the task.
     """
     from actors.policies.by_name import make_policy as make  # noqa: PLC0415
@@ -160,11 +163,11 @@ def play(
     """Play one episode.
 
     Args:
-        simulator: where it is played.
-        task: what is played.
-        policy: who acts.
-        situation: the value of each of the task's variables; without it, drawn with the seed.
-        seed: seed of everything random in the episode.
+        simulator: simulator that plays the scene.
+        task: the task.
+        policy: policy that chooses the actions.
+        situation: values of the task's variables by name; without it, a random situation.
+        seed: seed of all random numbers in the episode, including the random situation.
     """
     from actors.player import play as play_episode  # noqa: PLC0415
     from proto.episode import Kind  # noqa: PLC0415
@@ -195,15 +198,15 @@ def tutor(
     seed: int = 100_000,
     workers: int = 1,
 ) -> list[Path]:
-    """Record tutored sequences into a folder, one MCAP file each; what is there is kept.
+    """Record tutored sequences into a folder, one MCAP file each.
 
     Args:
-        folder: where they go.
-        config: names the task, the simulator and how often each case is tutored; without it, all
+        folder: the folder. Sequences that it already has are kept and not played again.
+        config: the configuration, which names task, simulator and repeats; without it, all
             defaults.
         cases: `all`, numbers and ranges of the tutored cases such as `0,3,7-9`, or `random:40`.
         seed: seed of the first random case.
-        workers: processes to play in.
+        workers: number of processes.
 
     Returns:
         The files of the folder.
@@ -225,12 +228,12 @@ def train(
     config: Config | None = None,
     on_epoch: Callable[[float], None] = lambda _: None,
 ) -> Path:
-    """Train VMDNN on recorded sequences; a training that was stopped goes on where it was.
+    """Train VMDNN on recorded sequences, or continue a training that was stopped.
 
     Args:
         data: folder of tutored sequences.
-        out: folder of the run; gets checkpoints and policies.
-        config: everything the training depends on; without it, all defaults.
+        out: folder of the run, for checkpoints and policies.
+        config: the configuration; without it, all defaults.
         on_epoch: called with the loss after each epoch.
 
     Returns:
@@ -264,14 +267,14 @@ def evaluate(
     seed: int = 1000,
     workers: int = 1,
 ) -> Tally:
-    """Play trials in situations that were not tutored, and count what succeeds.
+    """Play trials in situations that were not tutored, and count the successes.
 
     Args:
-        policy: see `make_policy`.
-        config: names the task and the simulator; without it, all defaults.
-        trials: how many.
+        policy: the policy, see `make_policy`.
+        config: the configuration, which names task and simulator; without it, all defaults.
+        trials: number of trials.
         seed: seed of the first situation; the same seed gives the same situations.
-        workers: processes to play in.
+        workers: number of processes.
     """
     from proto.config import Config as Default  # noqa: PLC0415
     from services.playing.workers import play_all  # noqa: PLC0415
@@ -285,7 +288,7 @@ def evaluate(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """The `vmdnn` command."""
+    """Run the `vmdnn` command and return the exit status."""
     from services.cli import main as run  # noqa: PLC0415
 
     return run(argv)

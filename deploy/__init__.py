@@ -1,3 +1,3 @@
-"""What starts the system: set-up, supervision, configs. Nothing else imports this package."""
+"""Starts the system: set-up, supervision, configurations. No other package imports this one."""
 
-DISTRIBUTION = "vmdnn"  # vmdnn.py sees by it whether another package took this name
+DISTRIBUTION = "vmdnn"  # vmdnn.py checks that no other distribution has replaced this package

@@ -1,4 +1,4 @@
-"""A whole run on this machine: start all processes, show their state, stop them, report."""
+"""Plays a run on this machine: starts all processes, shows their state, stops them, reports."""
 
 from __future__ import annotations
 
@@ -33,21 +33,28 @@ VMDNN: Final = str(Path(sys.executable).with_name("vmdnn"))
 HUB_WITHIN_S: Final = 30.0
 TOO_MANY_CRASHES: Final = 5
 TOO_SHORT_S: Final = 60.0
-"""A process that crashes TOO_MANY_CRASHES times within this time is not started again."""
+"""A process that crashes TOO_MANY_CRASHES times within this time ends the run."""
 
 
 class ProcessFailedError(Exception):
-    """A process cannot go on, or crashes again and again; the message has the end of its log."""
+    """A process has ended for good or crashes repeatedly; the message has the end of its log."""
 
-    def __init__(self, process: ProcessState, what: str) -> None:
+    def __init__(self, process: ProcessState, problem: str) -> None:
         lines = process.log.read_text(errors="replace").splitlines() if process.log.exists() else []
         last = "\n".join(f"    {line}" for line in lines[-12:])
-        super().__init__(f"{process.name} {what}; the end of {process.log}:\n{last}")
+        super().__init__(f"{process.name} {problem}; the end of {process.log}:\n{last}")
         self.exit_status = BAD_INPUT if process.exit_status == BAD_INPUT else 1
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Play a run until it is done or should stop; gives the exit status."""
+    """Play a run until it is done or is to stop.
+
+    Args:
+        argv: the arguments; None for those of the process.
+
+    Returns:
+        The exit status.
+    """
     arguments = _parser().parse_args(argv)
     try:
         overrides = list(arguments.overrides)
@@ -68,27 +75,32 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def default_actors() -> int:
-    """One actor for each core: while the learner computes, they share what it leaves."""
+    """Return one actor for each core; they use the processor time that the learner leaves."""
     return len(os.sched_getaffinity(0))
 
 
 def run(config: Config, actors: int, console: Console) -> None:
-    """Play a run with so many actors until it is done or this process should stop.
+    """Play a run until it is done or this process is to stop.
+
+    Args:
+        config: the configuration of the run.
+        actors: number of actors.
+        console: shows the state of the run.
 
     Raises:
         UserError: the run's folder cannot be used.
-        ProcessFailedError: one of the processes cannot go on.
+        ProcessFailedError: a process has ended for good or crashes repeatedly.
     """
     started_s = time.monotonic()
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
-    known = (config.run_folder / "config.yaml").exists()
+    exists = (config.run_folder / "config.yaml").exists()
     logs = config.run_folder / "logs"
-    # The learner writes the run's own config.yaml, once it knows that the run can go on with it.
+    # The learner writes config.yaml of the run, after it has checked that the run can continue.
     file = logs / "config.yaml"
     config.save(file)
     console.print(
-        f"{'going on with' if known else 'starting'} run {config.run.name} with {actors} "
+        f"{'continuing' if exists else 'starting'} run {config.run.name} with {actors} "
         f"{'actor' if actors == 1 else 'actors'} in {config.run_folder}",
         highlight=False,
     )
@@ -104,7 +116,7 @@ def run(config: Config, actors: int, console: Console) -> None:
 
 
 def programs(config: Config, file: Path, actors: int) -> list[Program]:
-    """The programs of a run, in the order in which they are started."""
+    """Return the programs of a run, in the order in which they are started."""
 
     def vmdnn(role: Role) -> tuple[str, ...]:
         return (VMDNN, role.value, "--config", str(file))
@@ -115,7 +127,7 @@ def programs(config: Config, file: Path, actors: int) -> list[Program]:
             "learner",
             vmdnn(Role.LEARNER),
             threads=config.learner.threads,
-            stop_within_s=30,  # it saves its state
+            stop_within_s=30,  # it saves a checkpoint
         ),
         Program("evaluator", vmdnn(Role.EVALUATOR)),
         Program("recorder", vmdnn(Role.RECORDER)),
@@ -126,7 +138,7 @@ def programs(config: Config, file: Path, actors: int) -> list[Program]:
 
 
 def is_done(view: RunView) -> bool:
-    """Whether learner and evaluator have reached what the configuration's `done` asks."""
+    """Return whether learner and evaluator report that the run is done."""
     learners = view.living(LearnerMetrics)
     evaluators = view.living(EvaluatorMetrics)
     if not learners or not evaluators:
@@ -135,38 +147,38 @@ def is_done(view: RunView) -> bool:
 
 
 class Crashes:
-    """Counts how often each process crashed and was started again."""
+    """Detects crashes of processes, which supervisord starts again."""
 
     def __init__(self) -> None:
-        """Start without any crash."""
+        """Start with no crashes."""
         self._started_s: dict[str, int] = {}
         self._crashes_s: defaultdict[str, deque[int]] = defaultdict(
             lambda: deque(maxlen=TOO_MANY_CRASHES)
         )
 
-    def look(self, processes: Iterable[ProcessState]) -> list[ProcessState]:
-        """The processes that were started again since the last look.
+    def update(self, processes: Iterable[ProcessState]) -> list[ProcessState]:
+        """Return the processes that were started again since the last call.
 
         Raises:
-            ProcessFailedError: starting a process again does not help.
+            ProcessFailedError: a process has ended for good or crashes repeatedly.
         """
-        back = []
+        restarted = []
         for process in processes:
             if process.gave_up:
-                raise ProcessFailedError(process, "cannot go on")
+                raise ProcessFailedError(process, "has ended and is not started again")
             before_s = self._started_s.get(process.name, 0)
             self._started_s[process.name] = process.started_s
             if before_s and process.started_s != before_s:
-                back.append(process)
+                restarted.append(process)
                 crashes_s = self._crashes_s[process.name]
                 crashes_s.append(process.started_s)
                 if len(crashes_s) == TOO_MANY_CRASHES and _span(crashes_s) < TOO_SHORT_S:
-                    raise ProcessFailedError(process, "crashes again and again")
-        return back
+                    raise ProcessFailedError(process, "crashes repeatedly")
+        return restarted
 
 
 def summary(view: RunView, config: Config, wall_s: float) -> str:
-    """The result of a run, in a few lines."""
+    """Return the result of a run in a few lines."""
     minutes, seconds = divmod(round(wall_s), 60)
     lines = [
         f"run {config.run.name}: {view.policy_version} policy versions"
@@ -181,14 +193,14 @@ def summary(view: RunView, config: Config, wall_s: float) -> str:
 def _follow(
     board: Board, supervisor: Supervisor, lifecycle: Lifecycle, console: Console
 ) -> RunView:
-    """Show the state of the run until it is done or should stop; gives the last state."""
+    """Show the state of the run until it is done or is to stop; return the last state."""
     crashes = Crashes()
     with display(console) as show:
         while True:
             view = board.view()
             show(view)
-            for process in crashes.look(supervisor.processes()):
-                console.print(f"{process.name} crashed and is back; see {process.log}")
+            for process in crashes.update(supervisor.processes()):
+                console.print(f"{process.name} crashed and was started again; see {process.log}")
             if lifecycle.stopping or is_done(view):
                 return view
             lifecycle.wait(METRICS_PERIOD_S)
@@ -201,15 +213,15 @@ def _connect(config: Config, supervisor: Supervisor, lifecycle: Lifecycle) -> Bu
         try:
             return open_bus(config.hub, config.run.name, Role.WATCH, f"run-local-{os.getpid()}")
         except UserError:
-            crashes.look(supervisor.processes())
+            crashes.update(supervisor.processes())
             if lifecycle.stopping or time.monotonic() > deadline:
                 raise
 
 
 def _newest_counted(scores: Sequence[PolicyScore], config: Config) -> PolicyScore | None:
-    """The newest policy of which all trials are counted; if none is, of which any is."""
-    whole = [score for score in scores if score.trials >= config.evaluator.trials_per_policy]
-    return max(whole or scores, key=lambda score: score.version, default=None)
+    """Return the score of the newest policy with all trials counted, or else with any counted."""
+    complete = [score for score in scores if score.trials >= config.evaluator.trials_per_policy]
+    return max(complete or scores, key=lambda score: score.version, default=None)
 
 
 def _score_lines(score: PolicyScore | None, config: Config) -> list[str]:
@@ -234,7 +246,7 @@ def _span(times_s: Sequence[int]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="run_local", add_help=False)  # run_local.sh has the help
+    parser = argparse.ArgumentParser(prog="run_local", add_help=False)  # run_local.sh prints it
     parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG)
     parser.add_argument("--actors", type=integer(0))
     parser.add_argument("--backend")

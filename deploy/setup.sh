@@ -1,8 +1,8 @@
 # shellcheck shell=bash
 # Sourced by run_local.sh and test.sh. `setup` installs what this checkout needs to run: Python, a
-# compiler, the locked packages in .venv, and a graphics driver with which the chosen simulator can
-# render. Its arguments are those of run_local.sh; they choose the simulator. It leaves alone what
-# is there, so that a second call takes about a second.
+# compiler, the locked packages in .venv, and a graphics driver for the simulator. Its arguments are
+# those of run_local.sh, which select the simulator. It installs only what is missing; a second call
+# takes about a second.
 
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="$ROOT/.venv"
@@ -24,7 +24,7 @@ fail() {
 
 # --- Python -----------------------------------------------------------------------------------
 
-# Prints the first Python for which the lock was made and that can make environments.
+# Prints the first Python that the lock is made for and that can make virtual environments.
 find_python() {
     local python
     for python in python3 python3.12 python3.11; do
@@ -51,7 +51,7 @@ setup_python() {
 
 # --- compiler ---------------------------------------------------------------------------------
 
-# Training compiles its kernel for this machine's processor, and is slower where it cannot.
+# Training compiles its kernels for this machine's processor; without a compiler it is slower.
 setup_compiler() {
     local compiler
     for compiler in "${CXX:-c++}" g++ clang++; do
@@ -72,7 +72,7 @@ setup_packages() {
     digest="$(cat "$LOCK" "$ROOT/pyproject.toml" | sha256sum)"
     [[ -f "$stamp" && "$(<"$stamp")" == "$digest" ]] && return
     say "installing $(grep -c == "$LOCK") packages into .venv (takes minutes the first time)"
-    # torch comes first and by itself: its build for this machine decides what else it needs.
+    # torch is installed first and with its dependencies, which depend on its build for this machine.
     pip_install --constraint "$LOCK" torch
     pip_install --no-deps --requirement "$LOCK"
     pip_install --no-deps --no-build-isolation --editable "$ROOT"
@@ -82,10 +82,10 @@ setup_packages() {
 
 pip_install() {
     PYTHONWARNINGS=ignore "$VENV/bin/python" -m pip install --quiet --no-input --disable-pip-version-check \
-        --root-user-action=ignore "$@" || fail "pip could not install; is the network there?"
+        --root-user-action=ignore "$@" || fail "pip could not install; see above; is there a network?"
 }
 
-# Some of the packages expect shared libraries that a bare system lacks: OpenMP and X11.
+# Some packages need shared libraries that a minimal system does not have: OpenMP and X11.
 setup_libraries() {
     imports 2>/dev/null && return
     local libraries=(libgomp1 libx11-6)
@@ -102,11 +102,11 @@ for name in BACKENDS: load_backend(name)')
 
 # --- graphics ---------------------------------------------------------------------------------
 
-# Each simulator knows by itself whether it can render, and which packages provide its driver.
+# Each simulator reports whether it can render, and which packages provide its driver.
 setup_graphics() {
     local answer packages status=0
     answer="$(examine_graphics "$@" 2>/dev/null)" || status=$?
-    # 2: bad input, such as a simulator that does not exist; run_local.py says what is wrong with it
+    # 2: bad input, such as a simulator that does not exist; run_local.py prints the message
     if ((status == 0 || status == 2)); then return; fi
     read -ra packages <<<"$answer"
     if ((${#packages[@]} == 0)); then
@@ -114,7 +114,7 @@ setup_graphics() {
     fi
     if ! can_install; then
         examine_graphics "$@" >/dev/null || true
-        fail "no graphics driver that can render; start this once as root, or as root:" \
+        fail "no graphics driver can render; run this script once as root, or as root:" \
             "$(apt_line "${packages[@]}")"
     fi
     say "installing the graphics driver (${packages[*]})"
@@ -123,13 +123,13 @@ setup_graphics() {
     examine_graphics "$@" >/dev/null || fail "the graphics driver still cannot render; see above"
 }
 
-# Succeeds where the chosen simulator can render. Else it prints the arguments for apt-get that cure
-# it, if any do, and says on standard error what is wrong and what to do.
+# Succeeds if the selected simulator can render. Otherwise it prints the packages to install, if any,
+# and writes to standard error what is wrong and what to do.
 examine_graphics() {
     "$VENV/bin/python" -m actors.backends --config "$ROOT/deploy/config/experiment1.yaml" "$@"
 }
 
-# Adds bookworm-backports from the mirror that this machine takes Debian 12 from.
+# Adds bookworm-backports from this machine's mirror of Debian 12.
 add_backports() {
     local list=/etc/apt/sources.list.d/bookworm-backports.list
     if apt-get indextargets --format '$(RELEASE)' | grep -qx bookworm-backports; then return; fi
@@ -145,7 +145,7 @@ add_backports() {
 can_install() {
     command -v apt-get >/dev/null || return 1
     [[ $EUID -eq 0 ]] && return
-    # Without a terminal nobody can type a password.
+    # Without a terminal sudo cannot ask for a password.
     if [[ -t 0 ]]; then command -v sudo >/dev/null; else sudo -n true 2>/dev/null; fi
 }
 

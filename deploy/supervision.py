@@ -1,4 +1,7 @@
-"""The processes of a run under supervisord: crashed ones come back, none outlives the run."""
+"""Runs the processes of a run under supervisord.
+
+Processes that crash are started again. All processes end when the run ends.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +25,10 @@ from proto.storage import written_whole
 
 START_WITHIN_S: Final = 20.0
 BAD_INPUT: Final = 2
-"""Exit status for bad input: the process is not started again."""
+"""Exit status for bad input; a process that ends with it is not started again."""
 
-# The kernel sends SIGTERM to a process whose parent dies, whatever the reason: when the script is
-# killed, all its processes end.
+# The kernel sends SIGTERM to a process when its parent dies for any reason. All processes therefore
+# end when the script is killed.
 _DIES_WITH_PARENT: Final = ("setpriv", "--pdeathsig", "TERM", "--")
 
 
@@ -34,10 +37,10 @@ class Program:
     """Processes that run the same command.
 
     Attributes:
-        name: name of the process; where there are several, `name-1`, `name-2` and so on.
-        command: what it runs.
-        threads: number of threads that each process may compute with; more threads than cores
-            make all of them much slower.
+        name: name of the process; several processes are called `name-1`, `name-2` and so on.
+        command: the command with its arguments.
+        threads: number of threads with which each process computes. More threads than cores slow
+            all processes down.
         processes: number of processes.
         stop_within_s: time from SIGTERM to SIGKILL.
     """
@@ -57,7 +60,7 @@ class ProcessState:
         name: name of the process, see Program.
         state: the state in supervisord's terms, such as RUNNING, EXITED or FATAL.
         pid: process id, 0 if it does not run.
-        started_s: when it was started last (Unix time), 0 if never.
+        started_s: time of its last start (Unix time), 0 if it was not started.
         exit_status: exit status of the last process of this name that ended.
         log: file with its output.
     """
@@ -76,23 +79,23 @@ class ProcessState:
 
 
 class Supervisor:
-    """Starts programs on request; when its context ends, it stops all in reverse order.
+    """Starts programs on request, and stops all in reverse order when its context ends.
 
-    The context must be entered on the main thread: the kernel ends the processes when the thread
-    that started them ends.
+    The context must be entered on the main thread, because the kernel ends the processes when the
+    thread that started them ends.
 
     Attributes:
         programs: the programs, in the order of starting.
     """
 
     def __init__(self, programs: Sequence[Program], folder: Path) -> None:
-        """Make a supervisor; its configuration and all logs are kept in `folder`."""
+        """Make a supervisor that writes its configuration and all logs to `folder`."""
         self.programs = programs
         self._folder = folder.resolve()
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
-        # A socket's path may have 107 characters at most, so it cannot lie in the run's folder.
+        # The path of a socket has at most 107 characters; that of the run's folder can be longer.
         self._socket_folder = tempfile.TemporaryDirectory(prefix="vmdnn-")
         socket = Path(self._socket_folder.name) / "socket"
         config = self._folder / "supervisord.conf"
@@ -104,10 +107,10 @@ class Supervisor:
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            start_new_session=True,  # Ctrl-C reaches only us, and we stop it in order
+            start_new_session=True,  # Ctrl-C must not reach supervisord
         )
         try:
-            self._wait_until_it_answers(config)
+            self._wait_until_it_replies(config)
         except BaseException:
             self.stop()
             raise
@@ -122,11 +125,11 @@ class Supervisor:
         self.stop()
 
     def start(self, program: str) -> None:
-        """Start the processes of a program; from now on they are started again when they crash."""
+        """Start the processes of a program; supervisord starts them again when they crash."""
         self._ask("startProcessGroup", program, False)
 
     def processes(self) -> list[ProcessState]:
-        """The state of all processes."""
+        """Return the state of all processes."""
         return [
             ProcessState(
                 name=info["name"],
@@ -153,12 +156,12 @@ class Supervisor:
         self._socket_folder.cleanup()
 
     def _ask(self, method: str, *arguments: object) -> Any:
-        # A transport that failed once stays broken, so each question gets its own.
+        # A transport cannot be used again after a failure, so each request makes a new one.
         transport = SupervisorTransport(serverurl=f"unix://{self._socket}")
         with ServerProxy("http://supervisord", transport) as supervisord:
             return getattr(supervisord.supervisor, method)(*arguments)
 
-    def _wait_until_it_answers(self, config: Path) -> None:
+    def _wait_until_it_replies(self, config: Path) -> None:
         deadline = time.monotonic() + START_WITHIN_S
         while True:
             try:
@@ -175,10 +178,15 @@ class Supervisor:
 
 
 def supervisord_config(programs: Sequence[Program], folder: Path, socket: Path) -> str:
-    """The text of supervisord's configuration: logs in `folder`, commands through `socket`.
+    """Return the text of supervisord's configuration.
+
+    Args:
+        programs: the programs.
+        folder: folder of the logs.
+        socket: socket that supervisord listens on.
 
     Raises:
-        UserError: a name or value contains what supervisord's configuration cannot express.
+        UserError: a name or value contains characters that the configuration cannot contain.
     """
     head = f"""\
 [supervisord]
@@ -225,7 +233,7 @@ stdout_logfile_backups=1
 
 def _plain(value: str | Path) -> str:
     text = str(value)
-    # supervisord reads these as comments and placeholders, and has no way to quote them.
-    if odd := next((mark for mark in (" ;", " #", "%", "\n") if mark in text), None):
-        raise UserError(f"{text!r} holds {odd!r}, which supervisord cannot read: rename it")
+    # In supervisord's configuration these are comments and placeholders, and cannot be quoted.
+    if special := next((mark for mark in (" ;", " #", "%", "\n") if mark in text), None):
+        raise UserError(f"{text!r} contains {special!r}, which supervisord cannot read: rename it")
     return text

@@ -1,3 +1,3 @@
 """What serves: hub, evaluator, recorder, watch, and the command line."""
 
-DISTRIBUTION = "vmdnn"  # vmdnn.py sees by it whether another package took this name
+DISTRIBUTION = "vmdnn"  # vmdnn.py checks that no other distribution has replaced this package

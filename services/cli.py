@@ -20,33 +20,40 @@ class Command(Protocol):
         """Add the subcommand's arguments."""
 
     def run(self, arguments: argparse.Namespace) -> int:
-        """Run the subcommand; gives the exit status."""
+        """Run the subcommand and return the exit status."""
 
 
-# Each module is imported only when its subcommand is asked for: `vmdnn hub` needs no torch.
+# A module is imported only when its subcommand is used: `vmdnn hub` does not import torch.
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "hub": ("services.commands.hub", "the router that all processes connect to"),
     "learner": ("services.commands.learner", "store tutoring, train, publish policies"),
     "actor": ("services.commands.actor", "play scenes with the newest policy"),
-    "evaluator": ("services.commands.evaluator", "hand out trials and count success"),
+    "evaluator": ("services.commands.evaluator", "assign trials and count successes"),
     "recorder": ("services.commands.recorder", "record every episode as MCAP"),
     "watch": ("services.commands.watch", "show what all processes are doing"),
     "control": ("services.commands.control", "pause, resume or stop processes of a run"),
     "tutor": ("services.commands.tutor", "record tutoring sequences, without the bus"),
     "train": ("services.commands.train", "train a network on recorded sequences"),
-    "evaluate": ("services.commands.evaluate", "test a policy on unlearned situations"),
+    "evaluate": ("services.commands.evaluate", "test a policy in situations not tutored"),
     "compare": ("services.commands.compare", "train and test VMDNN and other networks"),
     "figure": ("services.commands.figure", "draw a figure of the paper, or of failures"),
     "replay": ("services.commands.replay", "make a video of a recorded episode"),
-    "recover": ("services.commands.recover", "repair an MCAP file that was cut off"),
-    "inspect": ("services.commands.inspect", "look into a network, a checkpoint or its vision"),
+    "recover": ("services.commands.recover", "repair a truncated MCAP file"),
+    "inspect": ("services.commands.inspect", "show a network, a checkpoint, a task or its vision"),
     "bench": ("services.commands.bench", "measure speed on this machine"),
     "doctor": ("services.commands.doctor", "check this machine and say what to do"),
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one subcommand; gives its exit status, 2 for bad input, which is explained."""
+    """Run one subcommand.
+
+    Args:
+        argv: the arguments; None for those of the process.
+
+    Returns:
+        The exit status: 2 after a message about bad input.
+    """
     _use_one_thread()
     parser = argparse.ArgumentParser(
         prog="vmdnn",
@@ -56,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     parser.add_argument("--version", action="version", version=f"%(prog)s {version('vmdnn')}")
     words = list(sys.argv[1:] if argv is None else argv)
-    asked = next((word for word in words if not word.startswith("-")), None)
+    chosen = next((word for word in words if not word.startswith("-")), None)
     for name, (module, summary) in COMMANDS.items():
         subparser = subparsers.add_parser(
             name,
@@ -64,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             description=summary[0].upper() + summary[1:] + ".",
             formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         )
-        if name == asked:
+        if name == chosen:
             command = cast("Command", importlib.import_module(module))
             command.configure(subparser)
             subparser.set_defaults(run=command.run)
@@ -84,8 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _use_one_thread() -> None:
     """Keep numpy from starting a thread for each core; must run before numpy is imported.
 
-    The matrix products here are small: with many processes on a few cores such threads cost more
-    than ten times what they save. The learner sets the number of its threads itself.
+    The matrix products here are small. With many processes on a few cores, such threads would make
+    them more than ten times slower. The learner sets the number of its threads itself.
     """
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")

@@ -1,3 +1,3 @@
 """What is simulated: the iCub with a right hand of our own, built from the official model."""
 
-DISTRIBUTION = "vmdnn"  # vmdnn.py sees by it whether another package took this name
+DISTRIBUTION = "vmdnn"  # vmdnn.py checks that no other distribution has replaced this package

@@ -1,4 +1,4 @@
-"""Arguments that several subcommands take, and what they mean."""
+"""Command-line arguments that several subcommands share, and the configuration they select."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--connect",
         metavar="tcp/HOST:PORT",
-        help="where the hub listens; without it, hub.endpoint of the configuration",
+        help="endpoint of the hub; without it, hub.endpoint of the configuration",
     )
 
 
@@ -53,7 +53,10 @@ def add_process(parser: argparse.ArgumentParser) -> None:
 
 
 def config_file(name: str) -> Path:
-    """The file of a configuration: a path, or the name of one that comes with vmdnn.
+    """Return the file of a configuration.
+
+    Args:
+        name: a path, or the name of a built-in configuration.
 
     Raises:
         UserError: there is neither a file nor a built-in configuration of this name.
@@ -77,7 +80,7 @@ def _config_argument(name: str) -> Path:
 
 
 def config_of(arguments: argparse.Namespace) -> Config:
-    """The configuration that the arguments of `add_config`, or of more than these, ask for."""
+    """Load the configuration that --config, --set and, if present, --connect select."""
     overrides = list(arguments.overrides)
     if getattr(arguments, "connect", None) is not None:
         overrides.append(f"hub.endpoint={arguments.connect}")
@@ -114,14 +117,19 @@ def add_playing(parser: argparse.ArgumentParser) -> None:
 
 
 def playing_config(arguments: argparse.Namespace, overrides: Sequence[str] = ()) -> Config:
-    """The configuration that the arguments of `add_config` and `add_playing` ask for."""
-    asked = {"task.name": arguments.task, "simulator.backend": arguments.backend}
-    named = [f"{key}={value}" for key, value in asked.items() if value is not None]
-    return load_config(arguments.config, [*arguments.overrides, *named, *overrides])
+    """Load the configuration that the arguments of `add_config` and `add_playing` select.
+
+    Args:
+        arguments: the parsed arguments.
+        overrides: further `key.path=value` overrides.
+    """
+    options = {"task.name": arguments.task, "simulator.backend": arguments.backend}
+    given = [f"{key}={value}" for key, value in options.items() if value is not None]
+    return load_config(arguments.config, [*arguments.overrides, *given, *overrides])
 
 
 def integer(least: int, most: int | None = None) -> Callable[[str], int]:
-    """Make the `type=` of an argument that is an integer in least..most (None: unlimited)."""
+    """Return the `type=` of an argument that is an integer in least..most (None: unlimited)."""
     limits = f"of at least {least}" if most is None else f"from {least} to {most}"
 
     def number(text: str) -> int:
@@ -136,4 +144,4 @@ def integer(least: int, most: int | None = None) -> Callable[[str], int]:
 seed = integer(0, LARGEST_SEED)
 """`type=` of an argument that is a seed."""
 positive = integer(1)
-"""`type=` of an argument that is a number of things."""
+"""`type=` of an argument that is a positive integer."""

@@ -1,4 +1,4 @@
-"""Running a process of the bus from the command line."""
+"""Runs a process on the bus from the command line."""
 
 from __future__ import annotations
 
@@ -19,22 +19,26 @@ class Process(Protocol):
     """A process on the bus."""
 
     def run(self) -> None:
-        """Work until the lifecycle says stop."""
+        """Run until the lifecycle is stopping."""
 
 
 MakeProcess = Callable[[Config, Bus, Lifecycle], Process]
 
 
 def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) -> int:
-    """Run one process until SIGTERM, SIGINT or a control message stops it; the exit status.
+    """Run one process until SIGTERM, SIGINT or a control message stops it.
 
     Args:
-        arguments: those of `add_process`.
+        arguments: the parsed arguments of `add_process`.
         role: role of the process.
-        make: its class, or whatever makes it from configuration, bus and lifecycle.
+        make: makes the process from configuration, bus and lifecycle; usually its class.
+
+    Returns:
+        The exit status.
 
     Raises:
-        UserError: the configuration is wrong, no hub answers, or such a process works already.
+        UserError: the configuration is not valid, the hub does not reply, or the run already has
+            such a process.
     """
     start_logging(role)
     config = config_of(arguments)
@@ -46,8 +50,8 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
 
 
 def _identity(config: Config, role: Role, wanted: str | None) -> AbstractContextManager[str]:
-    """The id of the process: many actors share a run's folder, others are alone in it."""
-    if role is Role.HUB:  # it uses no folder
+    """Reserve the id of a process. A run has many actors, but one process of every other role."""
+    if role is Role.HUB:  # it does not use the run's folder
         return nullcontext(wanted or role.value)
     if role is Role.ACTOR:
         return own_id(config.run_folder, role, wanted)

@@ -1,4 +1,4 @@
-"""What the commands that train and test many networks share: arguments, progress, Ctrl-C."""
+"""Arguments and progress of the commands that train and test many networks."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from services.trials.success import READINGS, Tally
 from services.trials.sweeps import RunOutcomes, SweepRun, Variant
 
 Stores = tuple[TutoringStore, TutoringStore | None]
-"""Sequences for coupled training, and those for pre-training or None for the same."""
+"""Sequences for coupled training, and for pre-training; None for the same sequences."""
 
 
 def add_sweep(parser: argparse.ArgumentParser, *, trials: int) -> None:
-    """Add --seeds, --trials (with this default) and --trial-seed."""
+    """Add --seeds, --trials (with the default `trials`) and --trial-seed."""
     parser.add_argument(
         "--seeds", type=seed, nargs="+", default=[1, 2, 3], help="seeds of the trainings"
     )
@@ -39,16 +39,19 @@ def run_sweep(
     work: Path,
     stores_of: Callable[[Variant], Stores],
 ) -> list[RunOutcomes]:
-    """Train and test the networks that a folder lacks, with progress bars; the results of all.
+    """Train and test networks with progress bars; continue with the results in a folder.
 
     Args:
-        arguments: those of `add_sweep` and `common.add_playing`.
-        variants: what is trained and tested, each with every seed.
-        work: the folder.
-        stores_of: gives the sequences that a variant learns from.
+        arguments: the parsed arguments of `add_sweep` and `common.add_playing`.
+        variants: the networks, each trained with every seed.
+        work: the folder of networks and trials. Networks and trials in it are not repeated.
+        stores_of: returns the sequences that a variant learns from.
+
+    Returns:
+        The results of all networks.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C was pressed; what was done is in the folder.
+        KeyboardInterrupt: Ctrl-C was pressed; the results so far are in the folder.
     """
     runs = sweeps.open_runs(variants, arguments.seeds, work)
     console = Console(stderr=True)
@@ -60,7 +63,7 @@ def run_sweep(
             tested.append(_play_trials(run, arguments, name))
             console.print(f"{name}: {_counts(tested[-1])}", highlight=False)
     except KeyboardInterrupt:
-        console.print(f"stopped; the same command goes on with what is in {work}")
+        console.print(f"stopped; the same command continues with the results in {work}")
         raise
     return tested
 

@@ -12,7 +12,7 @@ from services.arguments.common import add_process
 from services.arguments.process import run_process
 
 NICENESS: Final = 10
-"""Where cores are few, the learner comes first: all actors wait for its next policy."""
+"""Nice value of actors: the learner has priority, because all actors wait for its policies."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +21,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Play until told to stop."""
+    """Play episodes until the process is stopped."""
     os.nice(NICENESS)
     return run_process(arguments, Role.ACTOR, Actor)

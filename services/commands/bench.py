@@ -21,12 +21,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "actor", help="physics, rendering, the network's step, and the actor's whole loop"
     )
     bptt = subjects.add_parser(
-        "bptt", help="one epoch of coupled training, beside other ways to compute it"
+        "bptt", help="one epoch of coupled training, compared with other implementations"
     )
-    bptt.add_argument("--batch", type=positive, default=45, help="sequences")
-    bptt.add_argument("--steps", type=positive, default=124, help="their length")
+    bptt.add_argument("--batch", type=positive, default=45, help="number of sequences")
+    bptt.add_argument("--steps", type=positive, default=124, help="length of the sequences")
     bptt.add_argument(
-        "--threads", type=positive, default=len(os.sched_getaffinity(0)), help="of each contender"
+        "--threads",
+        type=positive,
+        default=len(os.sched_getaffinity(0)),
+        help="threads of each implementation",
     )
     for subject in (actor, bptt):
         add_config(subject)
@@ -34,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure and print."""
+    """Measure and print the speeds."""
     config = config_of(arguments)
     if arguments.subject == "actor":
         speed = _rounded(asdict(bench_actor(config)))

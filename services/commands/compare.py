@@ -30,27 +30,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         choices=tuple(CONTENDERS),
         default=list(CONTENDERS),
-        help="which of the networks",
+        help="networks to compare",
     )
     add_sweep(parser, trials=300)
     parser.add_argument(
         "--work",
         type=Path,
         required=True,
-        help="folder of the networks and their trials; the same command goes on with it",
+        help="folder of the networks and their trials; the same command continues with it",
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train and test what is missing, then print the results of each network."""
+    """Train and test the networks that are not done yet, then print the results of each network."""
     config = playing_config(arguments)
     stores = training_stores(arguments)
 
     def stores_of(variant: Variant) -> Stores:
         if variant.name != FIXED_GAZE:
             return stores
-        return _tutored_again(stores, variant, config, arguments)
+        return _repeated_stores(stores, variant, config, arguments)
 
     contenders = comparison.variants(config, arguments.only)
     tested = run_sweep(arguments, contenders, arguments.work, stores_of)
@@ -62,24 +62,24 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _tutored_again(
+def _repeated_stores(
     stores: Stores, variant: Variant, config: Config, arguments: argparse.Namespace
 ) -> Stores:
-    """The same tutoring repeated by a robot that does not move its head and focus."""
+    """Repeat the tutoring of both stores with a robot that does not move its head and focus."""
 
-    def again(store: TutoringStore, name: str) -> TutoringStore:
+    def repeat(store: TutoringStore, name: str) -> TutoringStore:
         folder = arguments.work / f"{variant.name}_{name}"
-        episodes = comparison.tutored_again(
+        episodes = comparison.repeat_tutoring(
             store, variant, config, folder, workers=arguments.workers
         )
-        what = f"{variant.name}: {name}"
-        with progress_bar(what, len(store)) as advance, closing(episodes):
+        label = f"{variant.name}: {name}"
+        with progress_bar(label, len(store)) as advance, closing(episodes):
             for _ in episodes:
                 advance()
         return TutoringStore(folder)
 
-    coupled, others = stores
+    coupled, pretraining = stores
     return (
-        again(coupled, "tutoring"),
-        None if others is None else again(others, "pretraining"),
+        repeat(coupled, "tutoring"),
+        None if pretraining is None else repeat(pretraining, "pretraining"),
     )

@@ -16,28 +16,30 @@ from proto.messages import Command, Control, ControlReply
 from services.arguments.common import add_connection, config_of
 
 ROLES: Final = tuple(role for role in Role if role is not Role.WATCH)
-"""Roles whose processes answer control messages."""
-ANSWER_WITHIN_S: Final = 60.0
-"""A checkpoint is written after the epoch that is going on, which takes its time."""
+"""Roles whose processes reply to control messages."""
+REPLY_WITHIN_S: Final = 60.0
+"""Longest time to wait for replies: the learner writes a checkpoint after its current epoch."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("role", choices=[role.value for role in ROLES], help="all of this role")
-    parser.add_argument("do", choices=[command.value for command in Command], help="what to do")
+    parser.add_argument(
+        "role", choices=[role.value for role in ROLES], help="role of the processes"
+    )
+    parser.add_argument("do", choices=[command.value for command in Command], help="the command")
     add_connection(parser)
-    parser.add_argument("--json", action="store_true", help="print the answers as JSON")
+    parser.add_argument("--json", action="store_true", help="print the replies as JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send the command and print the answer of each process; 1 if none answers."""
+    """Send the command and print the replies; without replies the exit status is 1."""
     config = config_of(arguments)
     role, control = Role(arguments.role), Control(Command(arguments.do))
     with open_bus(config.hub, config.run.name, Role.WATCH, f"control-{os.getpid()}") as bus:
-        replies = bus.ask(bus.keys.control(role), control, ControlReply, timeout_s=ANSWER_WITHIN_S)
+        replies = bus.ask(bus.keys.control(role), control, ControlReply, timeout_s=REPLY_WITHIN_S)
     if not replies:
         print(
-            f"no {role} of run {config.run.name!r} answers; `vmdnn watch --once` shows the "
+            f"no {role} of run {config.run.name!r} replies; `vmdnn watch --once` shows the "
             "processes of a run. Choose another run with --set run.name=NAME or "
             "--config RUN/config.yaml",
             file=sys.stderr,

@@ -18,7 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print what was found; the exit status is 1 if anything stands in the way."""
+    """Print the findings; the exit status is 1 if there is a problem."""
     findings = list(examine(config_of(arguments)))
     if arguments.json:
         print(json.dumps([asdict(finding) | {"ok": finding.ok} for finding in findings], indent=2))

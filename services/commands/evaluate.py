@@ -1,4 +1,4 @@
-"""`vmdnn evaluate`: test a policy on situations that were never tutored."""
+"""`vmdnn evaluate`: test a policy in situations that were not tutored."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="tutor, a baseline of the task (`vmdnn inspect task` lists them), pretrained:NAME, a"
         " checkpoint's file, or a class of your own as package.module:Class",
     )
-    parser.add_argument("--trials", type=positive, default=52, help="how many situations")
+    parser.add_argument("--trials", type=positive, default=52, help="number of situations")
     parser.add_argument(
         "--seed", type=seed, default=1000, help="the same seed gives the same situations"
     )
@@ -49,18 +49,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
         " variables; may be repeated",
     )
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
-    parser.add_argument("--outcomes", type=Path, help="file for one line of JSON a trial")
+    parser.add_argument(
+        "--outcomes", type=Path, help="file to write, with one line of JSON for each trial"
+    )
     parser.add_argument("--out", type=Path, help="folder in which the rollouts are recorded")
     parser.add_argument(
         "--states",
         action="store_true",
-        help="the rollouts carry the activity of the network's subnets; a megabyte each",
+        help="record the activity of the network's subnets in the rollouts; a megabyte each",
     )
     parser.add_argument("--video", type=Path, help="MP4 file for a video of the first trial")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Play the trials and print what succeeded."""
+    """Play the trials and print the success rates."""
     config = playing_config(arguments)
     jobs = _jobs(config, arguments)
     tally, first = Tally(), None
@@ -88,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _jobs(config: Config, arguments: argparse.Namespace) -> list[Job]:
     if arguments.states and arguments.out is None:
-        raise UserError("--states stand in the rollouts; say with --out where those are recorded")
+        raise UserError("--states are recorded in the rollouts; add --out DIR to record rollouts")
     if arguments.situation is None:
         jobs = trial_jobs(config, arguments.trials, arguments.seed, arguments.out)
     else:

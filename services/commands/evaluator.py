@@ -16,5 +16,5 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Evaluate until told to stop."""
+    """Evaluate policies until the process is stopped."""
     return run_process(arguments, Role.EVALUATOR, Evaluator)

@@ -11,7 +11,7 @@ from typing import Final, Protocol
 from rich.console import Console
 
 from services.commands.figures import activity, corrections, failures, gestures, time_constants
-from services.figures.drawn import Drawn
+from services.figures.figure_result import FigureResult
 from services.figures.style import check_name, save
 
 
@@ -21,10 +21,10 @@ class FigureCommand(Protocol):
     SUMMARY: str
 
     def configure(self, parser: argparse.ArgumentParser) -> None:
-        """Add what it takes besides --out and --json."""
+        """Add the figure's arguments, except --out and --json."""
 
-    def draw(self, arguments: argparse.Namespace) -> Drawn:
-        """Find out the numbers and draw them."""
+    def draw(self, arguments: argparse.Namespace) -> FigureResult:
+        """Compute the numbers and draw the figure."""
 
 
 FIGURES: Final[Mapping[str, FigureCommand]] = {
@@ -52,8 +52,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw the figure, and print its numbers."""
-    check_name(arguments.out)  # before hours of work
+    """Draw the figure and print its numbers."""
+    check_name(arguments.out)  # first, because drawing can take hours
     drawn = FIGURES[arguments.figure].draw(arguments)
     save(drawn.figure, arguments.out)
     if arguments.json:

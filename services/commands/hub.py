@@ -16,5 +16,5 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Listen at the endpoint until told to stop."""
+    """Listen on the endpoint until the process is stopped."""
     return run_process(arguments, Role.HUB, Hub)

@@ -1,4 +1,4 @@
-"""`vmdnn inspect`: networks, checkpoints, tasks, and what the vision represents."""
+"""`vmdnn inspect`: show a network, a checkpoint, a task, or what the vision represents."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the subnets, the metadata, or the scores of the vision."""
+    """Print the network's subnets, the checkpoint's metadata, the task, or the vision's scores."""
     arguments.inspect(arguments)
     return 0
 

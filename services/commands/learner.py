@@ -20,12 +20,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Learn until told to stop."""
+    """Learn until the process is stopped."""
     return run_process(arguments, Role.LEARNER, _make_learner)
 
 
 def _make_learner(config: Config, bus: Bus, lifecycle: Lifecycle) -> Learner:
-    """A learner that knows the task and that of pre-training."""
+    """Make a learner with the tasks of coupled training and of pre-training."""
     names = filter(None, (config.task.name, config.pretraining_task))
     tasks = {name: make_task(config.task_called(name)) for name in names}
     return Learner(config, bus, lifecycle, tasks=tasks)

@@ -16,5 +16,5 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Record rollouts until told to stop."""
+    """Record rollouts until the process is stopped."""
     return run_process(arguments, Role.RECORDER, Recorder)

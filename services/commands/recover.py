@@ -1,4 +1,4 @@
-"""`vmdnn recover`: save the intact part of an MCAP file that was cut off."""
+"""`vmdnn recover`: restore the intact part of a truncated MCAP file."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ from proto.recordings.recovery import recover
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
-    parser.add_argument("file", type=Path, help="MCAP file, or the .part file that a kill left")
+    parser.add_argument(
+        "file", type=Path, help="MCAP file, or the .part file that a killed process left"
+    )
     parser.add_argument(
         "--out", type=Path, help="file to write; without it, the file itself is repaired"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Recover the file, and say how much of it was intact."""
+    """Recover the file and print how much of it was intact."""
     found = recover(arguments.file, arguments.out)
     target = arguments.out or arguments.file
     kept = f"{found.messages} messages"

@@ -16,13 +16,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
     parser.add_argument("file", type=Path, help="recorded episode, whole or recovered")
     parser.add_argument("--out", type=Path, required=True, help="MP4 file to write")
-    parser.add_argument("--fps", type=float, help="steps per second; without it, as fast as it was")
-    parser.add_argument("--backend", help="simulator that renders; without it, the recorded one")
+    parser.add_argument("--fps", type=float, help="steps per second; without it, real time")
+    parser.add_argument(
+        "--backend", help="simulator that renders; without it, the one that played the episode"
+    )
     add_config(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Render the episode."""
+    """Render the episode as a video."""
     episode = read_episode(arguments.file, partial=True)
     simulator = SimulatorConfig(backend=arguments.backend or episode.backend)
     config = config_of(arguments).model_copy(update={"simulator": simulator})

@@ -33,12 +33,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     add_training_data(parser)
     parser.add_argument(
-        "--out", type=Path, required=True, help="folder of the run; goes on with the one in it"
+        "--out", type=Path, required=True, help="folder of the run; a run in it is continued"
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train to the end or until Ctrl-C; the run's folder then holds everything learned."""
+    """Train until the end or Ctrl-C; the run's folder then contains checkpoints and policies."""
     config = config_of(arguments)
     store, others = training_stores(arguments)
     folder: Path = arguments.out
@@ -48,7 +48,10 @@ def run(arguments: argparse.Namespace) -> int:
     trainer = open_training(recipe, folder, store, others)
     config.save(folder / "config.yaml")
     if trainer.finished:
-        print(f"{folder} is trained already; learner.epochs above {trainer.epochs_done} goes on")
+        print(
+            f"{folder} is trained already; to continue, set learner.epochs above"
+            f" {trainer.epochs_done}"
+        )
         return 0
     with interruption() as interrupted, _progress(trainer) as show:
 
@@ -58,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         run_training(trainer, folder, go_on)
     if not trainer.finished:
-        print(f"stopped; the same command goes on from {training_file(folder)}")
+        print(f"stopped; the same command continues from {training_file(folder)}")
         return _INTERRUPTED
     _print_summary(trainer, folder)
     return 0
@@ -66,7 +69,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _progress(trainer: Trainer) -> Iterator[Callable[[float], None]]:
-    """Show each epoch: with a bar on a terminal, elsewhere with a line every few seconds."""
+    """Yield a function that shows an epoch, given its loss.
+
+    On a terminal it updates a progress bar; elsewhere it prints a line every few seconds.
+    """
     console = Console()
     if not console.is_terminal:
         yield _line_printer(trainer)

@@ -23,26 +23,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cases",
         default="all",
-        help="of the tutored cases all, or numbers such as 0,3,7-9; or random:40, situations"
-        " drawn inside the ranges",
+        help="all tutored cases, or their numbers such as 0,3,7-9, or random:40 for 40 random"
+        " situations",
     )
     parser.add_argument(
         "--seed",
         type=seed,
         default=100_000,
-        help="of random cases, one after the other; trials of a policy have seeds of their own",
+        help="seed of the first random situation; the others have the next seeds",
     )
     parser.add_argument(
         "--repeats",
         type=positive,
-        help="how often each case is executed: once clean, then with noise; "
-        "without it, tutor.repeats of the configuration",
+        help="executions of each case, the first without noise; without it, tutor.repeats of the"
+        " configuration",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the recordings")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Record what the folder lacks, and show how well the tutor did."""
+    """Record the sequences that the folder does not have yet, and print the tutor's success."""
     repeats = [] if arguments.repeats is None else [f"tutor.repeats={arguments.repeats}"]
     config = playing_config(arguments, repeats)
     cases = parse_cases(arguments.cases, make_task(config.task), arguments.seed)

@@ -25,14 +25,12 @@ ONCE_WITHIN_S: Final = 2.5 * METRICS_PERIOD_S
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_connection(parser)
-    parser.add_argument(
-        "--once", action="store_true", help="show the state at this moment, and end"
-    )
+    parser.add_argument("--once", action="store_true", help="show the current state and end")
     parser.add_argument("--json", action="store_true", help="with --once: print JSON")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Watch until Ctrl-C, or once."""
+    """Show the state of the run until Ctrl-C, or once."""
     config = config_of(arguments)
     with open_bus(config.hub, config.run.name, Role.WATCH, f"watch-{os.getpid()}") as bus:
         board = Board(bus)
@@ -50,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _show_once(view: RunView, as_json: bool) -> int:
     if not view.metrics:
         print(
-            f"no process of run {view.run!r} answers; is that the run's name? "
+            f"no process of run {view.run!r} replies; is that the run's name? "
             "Choose another with --set run.name=NAME or --config RUN/config.yaml",
             file=sys.stderr,
         )

@@ -1,1 +1,1 @@
-"""Figures: of the paper, and of where a policy fails; what they show, computed and drawn."""
+"""Figures of the paper and of a policy's failures: their numbers, tables and drawings."""

@@ -1,4 +1,4 @@
-"""What goes on in the network while it acts (paper, figure 4)."""
+"""Figure of the network's activity during episodes (paper, figure 4)."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from proto.body import ACTION_NAMES, ARM, FOCUS, GRASP, NECK
 from proto.episode import Episode, Floats, States
 from proto.errors import UserError
 from proto.variables import Value
-from services.figures.style import BLACK, look, words_and_unit
+from services.figures.style import BLACK, figure_style, words_and_unit
 
 SUBNETS: Final[Mapping[str, str]] = {"mstnn_fast": "V_F", "pfc": "PFC", "mtrnn_fast": "M_F"}
-"""The subnets of the paper's figure, and what it calls them."""
+"""The subnets that the figure shows, with the paper's symbol of each."""
 UNITS_SHOWN: Final = 50
-"""Of a larger subnet only those units are shown that vary most."""
+"""Largest number of units shown of a subnet: those that vary most."""
 OUTPUTS: Final[Mapping[str, slice]] = {
     "neck\n(degrees)": NECK,
     "arm\n(degrees)": ARM,
@@ -34,7 +34,7 @@ OUTPUTS: Final[Mapping[str, slice]] = {
     "focus\nlevel": slice(FOCUS, FOCUS + 1),
 }
 _SAME_OUTPUTS: Final = 1e-3
-"""Rounding apart, a network that sees the same pictures again has the same outputs."""
+"""Largest difference by rounding between the outputs of a network that sees the same pictures."""
 _RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "grasp\nlevel": (0.5, 10.5),
     "focus\nlevel": (0.0, 21.0),
@@ -43,11 +43,11 @@ _RANGES: Final[Mapping[str, tuple[float, float]]] = {
 
 @dataclass(frozen=True)
 class Activity:
-    """What went on in a network in one episode of T steps.
+    """An episode of T steps with the activity of the network.
 
     Attributes:
         episode: the episode.
-        states: (T, units) of each subnet by name.
+        states: activity (T, units) of each subnet by name.
     """
 
     episode: Episode
@@ -55,17 +55,23 @@ class Activity:
 
     @property
     def phase_starts(self) -> NDArray[np.int64]:
-        """First step of each phase, and at the end T."""
+        """First step of each phase, followed by T."""
         phases = self.episode.phases
         starts = np.flatnonzero(np.diff(phases)) + 1
         return np.concatenate([[0], starts, [len(phases)]])
 
 
 def activity_of(episode: Episode, policy: StatefulPolicy | None) -> Activity:
-    """The states that an episode carries, or else those that its policy has seeing it again.
+    """Return an episode with its states.
+
+    Args:
+        episode: the episode.
+        policy: the policy that played it. It sees the pictures again to compute the states. If
+            None, the recorded states are used.
 
     Raises:
-        UserError: there are neither, or the episode was played by another policy.
+        UserError: there is neither a policy nor a recorded state, or another policy played the
+            episode.
     """
     if episode.states is not None and policy is None:
         states = episode.states
@@ -74,7 +80,7 @@ def activity_of(episode: Episode, policy: StatefulPolicy | None) -> Activity:
         states = policy.states(episode.images)
     else:
         raise UserError(
-            f"rollout {episode.id} of policy {episode.policy!r} carries no states; record it with"
+            f"rollout {episode.id} of policy {episode.policy!r} has no states; record it with"
             " `vmdnn evaluate --states`, or name the checkpoint that played it with --policy"
         )
     missing = SUBNETS.keys() - states.keys()
@@ -84,25 +90,31 @@ def activity_of(episode: Episode, policy: StatefulPolicy | None) -> Activity:
 
 
 def shown_units(activities: Sequence[Activity]) -> dict[str, NDArray[np.int64]]:
-    """Indices of the units to show of each subnet, the same in all episodes."""
+    """Choose the units to show of each subnet, the same for all episodes; their indices."""
     shown = {}
     for name in SUBNETS:
-        together = np.concatenate([activity.states[name] for activity in activities])
-        liveliest = np.argsort(together.std(axis=0))[-UNITS_SHOWN:]
-        shown[name] = np.sort(liveliest)
+        states = np.concatenate([activity.states[name] for activity in activities])
+        most_varying = np.argsort(states.std(axis=0))[-UNITS_SHOWN:]
+        shown[name] = np.sort(most_varying)
     return shown
 
 
 def change_per_step(activity: Activity) -> dict[str, float]:
-    """How fast each subnet develops: mean change of a unit from one step to the next."""
+    """Return for each subnet the mean magnitude of a unit's change from one step to the next."""
     return {name: float(np.abs(np.diff(activity.states[name], axis=0)).mean()) for name in SUBNETS}
 
 
 def difference_by_phase(one: Activity, other: Activity) -> dict[str, list[float]]:
-    """How far two episodes are apart in each phase: root mean square over units and steps."""
+    """Return for each subnet the difference between two episodes in each phase.
+
+    The difference is the root mean square over units and steps.
+
+    Raises:
+        UserError: the phases of the episodes differ.
+    """
     starts = one.phase_starts
     if not np.array_equal(starts, other.phase_starts):
-        raise UserError("the two rollouts have other phases; take two of the same task")
+        raise UserError("the two rollouts have different phases; choose two of the same task")
     return {
         name: [
             float(np.sqrt(np.square(part).mean()))
@@ -113,7 +125,7 @@ def difference_by_phase(one: Activity, other: Activity) -> dict[str, list[float]
 
 
 def numbers(activities: Sequence[Activity]) -> dict[str, Any]:
-    """All that the figure shows, for `json.dumps`."""
+    """Return the numbers of the figure, for `json.dumps`."""
     shown = shown_units(activities)
     result: dict[str, Any] = {
         "units": {name: units.tolist() for name, units in shown.items()},
@@ -125,7 +137,7 @@ def numbers(activities: Sequence[Activity]) -> dict[str, Any]:
 
 
 def table(activities: Sequence[Activity]) -> Table:
-    """How fast each subnet is, and how far two episodes are apart in it."""
+    """Return a table of each subnet's change per step and the difference between two episodes."""
     result = Table(caption="change of a unit in a step; root mean square difference by subtask")
     phases = len(activities[0].phase_starts) - 1 if len(activities) == 2 else 0
     for heading in ("subnet", "change", *(f"({phase})" for phase in range(1, phases + 1))):
@@ -139,8 +151,8 @@ def table(activities: Sequence[Activity]) -> Table:
 
 
 def draw(activities: Sequence[Activity]) -> Figure:
-    """One column for each episode: units of the subnets over time, outputs, phases."""
-    with look():
+    """Draw one column for each episode: units of the subnets over time, outputs and phases."""
+    with figure_style():
         shown = shown_units(activities)
         figure = Figure(figsize=(1.4 + 3.2 * len(activities), 7.4), layout="constrained")
         axes = figure.subplots(
@@ -159,12 +171,12 @@ def draw(activities: Sequence[Activity]) -> Figure:
         for first, name in zip(columns[0], [*SUBNETS, *OUTPUTS], strict=True):
             first.set_ylabel(_row_label(name, activities[0], shown))
         figure.align_ylabels(columns[0])
-        _explain(figure, columns[-1], margin)
+        _add_legends(figure, columns[-1], margin)
         return figure
 
 
-def _explain(figure: Figure, column: Sequence[Axes], margin: Sequence[Axes]) -> None:
-    """Colours and lines of a column, in the margin beside it."""
+def _add_legends(figure: Figure, column: Sequence[Axes], margin: Sequence[Axes]) -> None:
+    """Add the colour scale and the legends of a column in the margin beside it."""
     for axes in margin:
         axes.set_axis_off()
     scale = ScalarMappable(Normalize(-ACTIVATION_GAIN, ACTIVATION_GAIN), "RdBu_r")
@@ -199,8 +211,8 @@ def _draw_column(
         axes.set_yticks([])
         axes.spines[["top", "right"]].set_visible(True)
     for axes, (name, values) in zip(column[len(SUBNETS) :], OUTPUTS.items(), strict=True):
-        told = activity.episode.actions[:, values]
-        for value, value_name in zip(told.T, ACTION_NAMES[values], strict=True):
+        actions = activity.episode.actions[:, values]
+        for value, value_name in zip(actions.T, ACTION_NAMES[values], strict=True):
             axes.plot(
                 np.arange(steps) + 0.5, value, label=value_name.removeprefix("r_").replace("_", " ")
             )
@@ -239,16 +251,18 @@ def _row_label(name: str, activity: Activity, shown: Mapping[str, NDArray[np.int
 
 
 def _titles(activities: Sequence[Activity]) -> list[str]:
-    """What the episodes differ in; all of the situation where there is only one."""
+    """Return a title for each episode: the variables that differ; all for a single episode."""
     situations = [activity.episode.situation for activity in activities]
     first = situations[0]
-    told = [
+    shown = [
         name for name in first if len({situation.get(name) for situation in situations}) > 1
     ] or list(first)
-    return [", ".join(_told(name, situation[name]) for name in told) for situation in situations]
+    return [
+        ", ".join(_value_text(name, situation[name]) for name in shown) for situation in situations
+    ]
 
 
-def _told(name: str, value: Value) -> str:
+def _value_text(name: str, value: Value) -> str:
     words, unit = words_and_unit(name)
     if isinstance(value, str):
         return f"{words} {value}"
@@ -260,13 +274,13 @@ def _check_same_policy(episode: Episode, policy: StatefulPolicy) -> None:
         raise UserError(f"rollout {episode.id} was not played by a network, so it has no states")
     policy.begin(episode.situation, episode.seed)
     again = np.stack([_outputs(policy, image) for image in episode.images])
-    apart = (
+    difference = (
         np.abs(again - episode.outputs).max() if again.shape == episode.outputs.shape else np.inf
     )
-    if apart > _SAME_OUTPUTS:
+    if difference > _SAME_OUTPUTS:
         raise UserError(
             f"rollout {episode.id} was played by {episode.policy!r} version"
-            f" {episode.policy_version}, not by this policy: its outputs are others"
+            f" {episode.policy_version}, not by this policy, whose outputs differ"
         )
 
 

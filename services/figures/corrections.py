@@ -1,4 +1,4 @@
-"""Success against the number of tutored cases, after each round of corrections."""
+"""Figure of success against the number of tutored cases after each round of corrections."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from services.figures.style import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, look, percent
+from services.figures.style import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, figure_style, percent
 from services.terminal.rates import rate_text
 from services.trials.round_trials import RoundPolicy, Run
 from services.trials.success import Tally
@@ -28,7 +28,7 @@ class Curve:
 
     Attributes:
         run: the run.
-        tallies: one for each of `run.policies`.
+        tallies: the counted trials of each policy in `run.policies`.
     """
 
     run: Run
@@ -47,7 +47,7 @@ class Curve:
 
 
 def numbers(curves: Sequence[Curve]) -> dict[str, Any]:
-    """All that the figure shows, for `json.dumps`."""
+    """Return the numbers of the figure, for `json.dumps`."""
     return {
         "runs": [
             {
@@ -61,7 +61,7 @@ def numbers(curves: Sequence[Curve]) -> dict[str, Any]:
 
 
 def table(curves: Sequence[Curve]) -> Table:
-    """Success after each round."""
+    """Return a table of success after each round."""
     result = Table(caption="% of the trials with the 95 % interval")
     for heading in ("run", "round", "cases", *READINGS):
         result.add_column(heading, justify="left" if heading == "run" else "right")
@@ -79,14 +79,14 @@ def table(curves: Sequence[Curve]) -> Table:
 
 
 def draw(curves: Sequence[Curve]) -> Figure:
-    """One panel for each reading of success, one line a run."""
+    """Draw one panel for each reading of success, with one line for each run."""
     labels = _labels(curves)
-    with look():
+    with figure_style():
         figure = Figure(figsize=(7.0, 3.2), layout="constrained")
         panels = figure.subplots(1, len(READINGS), sharey=True)
         for axes, reading in zip(panels, READINGS, strict=True):
-            looks = zip(cycle(_COLOURS), cycle(_MARKERS), strict=False)
-            for curve, label, (colour, marker) in zip(curves, labels, looks, strict=False):
+            styles = zip(cycle(_COLOURS), cycle(_MARKERS), strict=False)
+            for curve, label, (colour, marker) in zip(curves, labels, styles, strict=False):
                 _draw_curve(axes, curve, reading, label=label, color=colour, marker=marker)
             axes.set_title(reading)
             axes.set_xlabel("tutored cases")
@@ -97,16 +97,16 @@ def draw(curves: Sequence[Curve]) -> Figure:
         return figure
 
 
-def _draw_curve(axes: Axes, curve: Curve, reading: str, **look_of: Any) -> None:
+def _draw_curve(axes: Axes, curve: Curve, reading: str, **style: Any) -> None:
     middle, reach = percent(tally.rate(reading) for tally in curve.tallies)
     cases = [policy.cases for policy in curve.run.policies]
     axes.errorbar(
-        cases, middle, yerr=reach, linewidth=1.0, markersize=4, elinewidth=0.9, capsize=2, **look_of
+        cases, middle, yerr=reach, linewidth=1.0, markersize=4, elinewidth=0.9, capsize=2, **style
     )
 
 
 def _labels(curves: Sequence[Curve]) -> list[str]:
-    """How each run was corrected, with the name of the run where two were corrected alike."""
+    """Return a label for each run: how its situations were chosen, with its name if ambiguous."""
     count = Counter(curve.choose for curve in curves)
     return [
         curve.choose

@@ -1,7 +1,8 @@
-"""Where a policy fails: at tutored values of the situation, or in between?
+"""Figure of the situations in which a policy fails.
 
-A network that snaps to the values that it was taught acts as if the nearest of them were the true
-one. Then it errs most midway between two of them, and its errors follow a saw-tooth.
+It shows whether a policy fails near tutored values of a variable or between them. A network that
+snaps to tutored values acts as if the nearest tutored value were the real one. Its errors are
+largest midway between two tutored values: they follow a sawtooth.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from services.figures.style import (
     PINK,
     READING_COLOURS,
     RED,
+    figure_style,
     label,
-    look,
     percent,
     words_and_unit,
 )
@@ -43,14 +44,14 @@ Array = NDArray[np.float64]
 
 READINGS: Final = ("strict", "precise")
 SHOWN: Final = 2.5
-"""Errors are shown up to so many times what they may be; beyond, the hand was elsewhere."""
+"""Largest error that is shown, in multiples of the allowed error; larger ones are clipped."""
 _MARKS: Final = ((GREEN, "o"), (ORANGE, "o"), (BLUE, "^"), (BLACK, "x"), (RED, "s"), (PINK, "D"))
-"""Colours and markers of the task's reasons, in their order; they repeat if there are more."""
+"""Colour and marker of each of the task's reasons in their order; repeated if there are more."""
 _Z95: Final = 1.96
 _EXPLANATION: Final = (
-    "Dotted: tutored values. Errors are those of trials in which the object was still in its place"
-    " when the hand closed;\nlarger ones stand at the edge; grey: about what a precise grasp may"
-    " have; black: a policy that takes the nearest tutored value for the true one."
+    "Dotted: tutored values. Errors are shown for trials in which the object had not moved before"
+    " the hand closed;\nlarger errors are drawn at the edge. Grey: approximate range of a precise"
+    " grasp. Black: a policy that acts for the nearest tutored value."
 )
 
 
@@ -60,8 +61,8 @@ class Axis:
 
     Attributes:
         variable: the variable.
-        values: (N,) its value in each trial; of a discrete variable the number of the choice.
-        tutored: its tutored values, in order.
+        values: (N,) its value in each trial; for a discrete variable the index of the choice.
+        tutored: its tutored values in ascending order.
     """
 
     variable: Variable
@@ -70,7 +71,7 @@ class Axis:
 
     @classmethod
     def of(cls, variable: Variable, trials: Sequence[CountedTrial], task: Task) -> Axis:
-        """The axis of a variable."""
+        """Make the axis of a variable."""
 
         def number(value: Value) -> float:
             if isinstance(variable, Discrete):
@@ -83,19 +84,19 @@ class Axis:
 
     @property
     def discrete(self) -> bool:
-        """Whether nothing lies between two of its values."""
+        """Whether the variable is discrete, so that there are no values between two others."""
         return isinstance(self.variable, Discrete)
 
 
 @dataclass(frozen=True)
 class Trials:
-    """N trials of one policy, and what it was tutored.
+    """N trials of one policy, and the tutored values.
 
     Attributes:
-        axes: the variables of which several values are tutored, by name.
-        situations: what was played in each trial.
-        outcomes: how each trial ended.
-        words: what the figure must know of the task.
+        axes: by name, the variables with several tutored values.
+        situations: situation of each trial.
+        outcomes: outcome of each trial.
+        words: labels and errors of the task.
     """
 
     axes: Mapping[str, Axis]
@@ -105,14 +106,14 @@ class Trials:
 
     @classmethod
     def of(cls, trials: Sequence[CountedTrial], task: Task) -> Trials:
-        """Trials of a task.
+        """Collect trials of a task.
 
         Raises:
-            UserError: there are none, or they are of another task.
+            UserError: there is no trial, or one is of another task.
         """
         if not trials:
             raise UserError(
-                "there is no trial to draw; `vmdnn evaluate --outcomes FILE` plays some"
+                "there is no trial to draw; `vmdnn evaluate --outcomes FILE` plays and saves trials"
             )
         for trial in trials:
             task.check(trial.situation)
@@ -125,15 +126,15 @@ class Trials:
         )
 
     def succeeded(self, reading: str) -> NDArray[np.bool_]:
-        """(N,) whether each trial succeeded in a reading."""
+        """Return (N,) whether each trial succeeded in a reading."""
         return np.array([getattr(outcome, reading) for outcome in self.outcomes], dtype=np.bool_)
 
     def ended_with(self, reason: str) -> NDArray[np.bool_]:
-        """(N,) whether a reason is that of each trial."""
+        """Return (N,) whether each trial ended with this reason."""
         return np.array([outcome.reason == reason for outcome in self.outcomes], dtype=np.bool_)
 
     def betweenness(self, name: str) -> Array:
-        """(N,) how far each value is from a tutored one: 0 at it, 1 midway between two."""
+        """Return (N,) the distance to the nearest tutored value: 0 at one, 1 midway between two."""
         axis = self.axes[name]
         tutored, values = axis.tutored, axis.values
         upper = np.clip(np.searchsorted(tutored, values), 1, len(tutored) - 1)
@@ -141,32 +142,32 @@ class Trials:
         return 2 * np.minimum(np.abs(values - below), np.abs(above - values)) / (above - below)
 
     def to_nearest(self, name: str) -> Array:
-        """(N,) from each value to the nearest tutored one."""
+        """Return (N,) the nearest tutored value minus the value of each trial."""
         axis = self.axes[name]
         nearest = axis.tutored[np.abs(axis.values[:, None] - axis.tutored).argmin(axis=1)]
         result: Array = nearest - axis.values
         return result
 
     def rate(self, reading: str, chosen: NDArray[np.bool_]) -> Rate:
-        """Success in one reading, over the chosen of the trials."""
+        """Return the success rate in one reading of the trials where `chosen` (N,) is true."""
         return Rate(int(self.succeeded(reading)[chosen].sum()), int(chosen.sum()))
 
     def approached(self) -> NDArray[np.bool_]:
-        """(N,) whether the hand closed while the object was still in its place."""
+        """Return (N,) whether the object had not moved before the hand closed."""
         in_place = (
             bool(outcome.measures) and self.words.in_place(outcome) for outcome in self.outcomes
         )
         return np.array(list(in_place), dtype=np.bool_)
 
     def reached(self) -> NDArray[np.bool_]:
-        """(N,) whether in addition the hand was about where the object was."""
+        """Return (N,) whether, in addition, all errors were small enough to be shown."""
         reached = self.approached()
         for error in self.words.errors:
             reached &= np.abs(self.error(error)) < SHOWN * error.allowed
         return reached
 
     def error(self, error: GraspError) -> Array:
-        """(N,) an error at the grasp; NaN where nothing was measured."""
+        """Return (N,) an error of the grasp in each trial; NaN if it was not measured."""
         pairs = zip(self.outcomes, self.situations, strict=True)
         errors = [
             error.measure(outcome, situation) if outcome.measures else np.nan
@@ -177,12 +178,13 @@ class Trials:
 
 @dataclass(frozen=True)
 class Snapping:
-    """How much of the way to the nearest tutored value the hand is drawn.
+    """How far a policy shifts its grasp to the nearest tutored value.
 
     Attributes:
-        share: 0 for a policy that interpolates, 1 for one that acts as if the nearest were true.
-        half_width: of its 95 % interval.
-        trials: from how many trials.
+        share: shift as a fraction of the distance to the nearest tutored value: 0 for a policy that
+            interpolates, 1 for one that acts for the nearest tutored value.
+        half_width: half the width of the 95 % interval of `share`.
+        trials: number of trials that it was estimated from.
     """
 
     share: float
@@ -191,10 +193,14 @@ class Snapping:
 
 
 def snapping(trials: Trials, name: str) -> Snapping | None:
-    """Snapping to tutored values of a variable; None if no error shows it, or with too few trials.
+    """Estimate how far a policy snaps to the tutored values of a variable.
 
-    Least squares of the error on the distance to the nearest tutored value; a constant error and
-    one that grows with the value, such as a pull to the middle of the range, are told apart.
+    The estimate is the least-squares coefficient of the error on the distance to the nearest
+    tutored value. The regression includes a constant error and one proportional to the value, such
+    as a bias to the middle of the range, so that they do not count as snapping.
+
+    Returns:
+        The estimate; None if the task has no error for the variable, or with too few trials.
     """
     shown_by = next((each for each in trials.words.errors if each.variable == name), None)
     if shown_by is None:
@@ -213,7 +219,7 @@ def snapping(trials: Trials, name: str) -> Snapping | None:
 
 
 def numbers(trials: Trials) -> dict[str, Any]:
-    """What the figure shows, for `json.dumps`."""
+    """Return the numbers of the figure, for `json.dumps`."""
     found = {name: snapping(trials, name) for name in trials.axes}
     return {
         "trials": len(trials.outcomes),
@@ -243,10 +249,10 @@ def numbers(trials: Trials) -> dict[str, Any]:
 
 
 def table(trials: Trials) -> Table:
-    """Success near tutored values and between them, and how far the hand snaps to them."""
+    """Return a table of success near tutored values and between them, and of snapping."""
     result = Table(
         caption="near: within a quarter of the spacing of a tutored value; snapping: 0 for none,"
-        " 1 for acting as if the nearest tutored value were the true one"
+        " 1 for a policy that acts for the nearest tutored value"
     )
     headings = (f"{reading} {place} %" for reading in READINGS for place in ("near", "between"))
     for heading in ("value", *headings, "snapping"):
@@ -262,13 +268,13 @@ def table(trials: Trials) -> Table:
             for chosen in places.values()
         ]
         found = snapping(trials, name)
-        drawn = "" if found is None else f"{found.share:.2f} ± {found.half_width:.2f}"
-        result.add_row(words_and_unit(name)[0], *cells, drawn)
+        text = "" if found is None else f"{found.share:.2f} ± {found.half_width:.2f}"
+        result.add_row(words_and_unit(name)[0], *cells, text)
     return result
 
 
 def _add_choices(result: Table, trials: Trials, axis: Axis) -> None:
-    """Success for each choice of a discrete variable; nothing lies between them."""
+    """Add a row with the success for each choice of a discrete variable."""
     for each in _bins(axis):
         strict, precise = (
             rate_text(trials.rate(reading, each.chosen), digits=0) for reading in READINGS
@@ -277,8 +283,8 @@ def _add_choices(result: Table, trials: Trials, axis: Axis) -> None:
 
 
 def draw(trials: Trials, title: str) -> Figure:
-    """Where trials failed, how often by each value, and the errors at the grasp."""
-    with look():
+    """Draw maps of the outcomes, success by value of each variable, and errors of the grasp."""
+    with figure_style():
         axes_shown, errors = list(trials.axes.values()), trials.words.errors
         figure = Figure(figsize=(9.0, 12.0), layout="constrained")
         figure.suptitle(title, fontsize=10)
@@ -291,7 +297,7 @@ def draw(trials: Trials, title: str) -> Figure:
             _draw_rates(column[0], trials, axis)
             for each, error in zip(column[1:], errors, strict=True):
                 _draw_errors(each, trials, axis, error)
-            _name_values(column[-1].xaxis, column[-1].set_xlabel, axis)
+            _label_axis(column[-1].xaxis, column[-1].set_xlabel, axis)
         axes[0, 0].set_ylabel("success (%)")
         for row, error in zip(axes[1:], errors, strict=True):
             row[0].set_ylabel(error.label)
@@ -302,7 +308,7 @@ def draw(trials: Trials, title: str) -> Figure:
 
 
 def _marks(trials: Trials) -> Iterator[tuple[str, str, str, str]]:
-    """Each reason that trials can end with: reason, words, colour, marker."""
+    """Yield each reason of an outcome with its label, colour and marker."""
     known = dict(trials.words.reasons)
     for outcome in trials.outcomes:
         known.setdefault(outcome.reason, outcome.reason.replace("_", " "))
@@ -317,27 +323,27 @@ def _draw_maps(figure: Any, trials: Trials) -> None:
     for each, (across, up) in zip(axes, pairs, strict=True):
         for reason, words, colour, marker in _marks(trials):
             chosen = trials.ended_with(reason)
-            fine = reason == NO_FAILURE
+            precise = reason == NO_FAILURE
             each.scatter(
                 across.values[chosen],
                 up.values[chosen],
-                s=7 if fine else 14,
+                s=7 if precise else 14,
                 color=colour,
                 marker=marker,
                 linewidths=0.8 if marker == "x" else 0,
-                alpha=0.35 if fine else 0.9,
+                alpha=0.35 if precise else 0.9,
                 label=f"{words} ({chosen.sum()})" if chosen.any() else None,
             )
-        _name_values(each.xaxis, each.set_xlabel, across)
-        _name_values(each.yaxis, each.set_ylabel, up)
+        _label_axis(each.xaxis, each.set_xlabel, across)
+        _label_axis(each.yaxis, each.set_ylabel, up)
         _mark_tutored(each.axvline, across.tutored)
         _mark_tutored(each.axhline, up.tutored)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), columnspacing=1.2)
 
 
-def _name_values(side: Any, set_label: Callable[[str], object], axis: Axis) -> None:
-    """Label a side of a panel; choices stand there by name."""
+def _label_axis(side: Any, set_label: Callable[[str], object], axis: Axis) -> None:
+    """Label an axis of a panel; for a discrete variable its ticks are the names of the choices."""
     set_label(label(axis.variable.name))
     if isinstance(axis.variable, Discrete):
         side.set_ticks(range(len(axis.variable.choices)), axis.variable.choices)
@@ -346,11 +352,11 @@ def _name_values(side: Any, set_label: Callable[[str], object], axis: Axis) -> N
 def _draw_rates(axes: Axes, trials: Trials, axis: Axis) -> None:
     bins = _bins(axis)
     centres = np.array([(each.low + each.high) / 2 for each in bins])
-    nudge = 0.02 * float(np.diff(axis.tutored).min())
+    offset = 0.02 * float(np.diff(axis.tutored).min())
     for side, reading in enumerate(READINGS):
         middle, reach = percent(trials.rate(reading, each.chosen) for each in bins)
         axes.errorbar(
-            centres + (2 * side - 1) * nudge,
+            centres + (2 * side - 1) * offset,
             middle,
             yerr=reach,
             color=READING_COLOURS[reading],
@@ -368,22 +374,22 @@ def _draw_errors(axes: Axes, trials: Trials, axis: Axis, error: GraspError) -> N
     allowed = error.allowed
     limit = SHOWN * allowed
     chosen, values = trials.approached(), axis.values
-    errors = np.clip(trials.error(error), -0.97 * limit, 0.97 * limit)  # none is left out
+    errors = np.clip(trials.error(error), -0.97 * limit, 0.97 * limit)  # all are shown
     axes.axhspan(-allowed, allowed, color=GREY, alpha=0.15, linewidth=0)
     axes.axhline(0, color=GREY, linewidth=0.5)
     for reason, _, colour, _ in _marks(trials):
-        those = chosen & trials.ended_with(reason)
-        axes.scatter(values[those], errors[those], s=4, color=colour, alpha=0.5, linewidths=0)
+        shown = chosen & trials.ended_with(reason)
+        axes.scatter(values[shown], errors[shown], s=4, color=colour, alpha=0.5, linewidths=0)
     if error.variable == axis.variable.name:
-        taught, snapped = _saw_tooth(axis.tutored)
-        axes.plot(taught, error.per_unit * snapped, color=BLACK, linewidth=0.7)
+        corners, snapped = _sawtooth(axis.tutored)
+        axes.plot(corners, error.per_unit * snapped, color=BLACK, linewidth=0.7)
     axes.set_ylim(-limit, limit)
     axes.set_yticks([-2 * allowed, -allowed, 0, allowed, 2 * allowed])
     _mark_tutored(axes.axvline, axis.tutored)
 
 
-def _saw_tooth(tutored: Array) -> tuple[Array, Array]:
-    """Values, and the errors at them of a policy that takes each for the nearest tutored one."""
+def _sawtooth(tutored: Array) -> tuple[Array, Array]:
+    """Return the corners of the sawtooth: values, and the errors there of a policy that snaps."""
     values, errors = [], []
     for below, above in pairwise(tutored):
         middle = (below + above) / 2
@@ -402,10 +408,10 @@ class _Bin:
     """A range of a variable's values.
 
     Attributes:
-        name: the choice, of a discrete variable; else empty.
-        low: its lower end.
-        high: its upper end.
-        chosen: (N,) which trials lie in it.
+        name: the choice of a discrete variable; empty for a continuous variable.
+        low: lower end of the range.
+        high: upper end of the range.
+        chosen: (N,) whether each trial is in the range.
     """
 
     name: str
@@ -414,12 +420,15 @@ class _Bin:
     chosen: NDArray[np.bool_]
 
     def limits(self, axis: Axis) -> dict[str, Any]:
-        """What it is, for `json.dumps`."""
+        """Return the choice or the ends of the range, for `json.dumps`."""
         return {"choice": self.name} if axis.discrete else {"from": self.low, "to": self.high}
 
 
 def _bins(axis: Axis) -> list[_Bin]:
-    """Ranges of the values in order: around tutored values and between them in turn, or choices."""
+    """Divide the values into ranges that are alternately near and between tutored values.
+
+    The ranges of a discrete variable are its choices.
+    """
     if isinstance(axis.variable, Discrete):
         return [
             _Bin(choice, number, number, axis.values == number)

@@ -1,4 +1,4 @@
-"""A contact sheet of gesture clips: who points, for either side, a few frames each."""
+"""A contact sheet of gesture clips: some frames of each subject's clip for both sides."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from services.figures.style import look
+from services.figures.style import figure_style
 from sim_assets.gestures.clip import FRAMES, SIDES, Clip, GestureLibrary, Side
 
 SHOWN_FRAMES: Final = (0, 8, 14, 20, 28, 39)
@@ -40,7 +40,7 @@ class Row:
 
 
 def rows_of(library: GestureLibrary) -> list[Row]:
-    """The first take of every subject; all takes if there is but one subject."""
+    """Return one row for the first take of each subject, or for each take of a single subject."""
     takes = library.takes if len(library.subjects) == 1 else library.takes[:1]
     return [
         Row(subject, take, {side: library.clip(side, subject, take) for side in SIDES})
@@ -50,8 +50,8 @@ def rows_of(library: GestureLibrary) -> list[Row]:
 
 
 def draw(rows: Sequence[Row]) -> Figure:
-    """One row a clip, one column a side."""
-    with look():
+    """Draw one row for each take and one column for each side."""
+    with figure_style():
         figure = Figure(figsize=(7.2, 0.3 + 0.62 * len(rows)), layout="constrained")
         panels = figure.subplots(len(rows), len(SIDES), squeeze=False)
         for row, pair in zip(rows, panels, strict=True):
@@ -66,7 +66,7 @@ def draw(rows: Sequence[Row]) -> Figure:
 
 
 def numbers(rows: Sequence[Row]) -> dict[str, Any]:
-    """All that the figure shows, for `json.dumps`."""
+    """Return the numbers of the figure, for `json.dumps`."""
     return {
         "frames": list(SHOWN_FRAMES),
         "clips": [
@@ -84,7 +84,7 @@ def numbers(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """Brightness and movement of each clip."""
+    """Return a table of the brightness and movement of each clip."""
     result = Table(caption="grey levels, 0 to 255")
     for heading in ("subject", "take", "side", "mean", "largest change from the first frame"):
         result.add_column(heading, justify="left" if heading == "side" else "right")

@@ -1,4 +1,4 @@
-"""How all figures look, and how they are written."""
+"""Style, labels and writing of all figures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from services.trials.success import Rate
 
 Array = NDArray[np.float64]
 
-# Okabe and Ito's colours, which colour-blind people tell apart too.
+# The palette of Okabe and Ito, which colour-blind people can distinguish.
 BLACK: Final = "#000000"
 ORANGE: Final = "#E69F00"
 SKY: Final = "#56B4E9"
@@ -31,7 +31,7 @@ GREY: Final = "#999999"
 
 READING_COLOURS: Final[Mapping[str, str]] = {"lenient": ORANGE, "strict": BLUE, "precise": GREEN}
 
-_LOOK: Final[dict[Any, Any]] = {
+_STYLE: Final[dict[Any, Any]] = {
     "font.size": 8,
     "axes.titlesize": 9,
     "axes.labelsize": 8,
@@ -48,45 +48,49 @@ _LOOK: Final[dict[Any, Any]] = {
 _UNITS: Final = {"m": "m", "deg": "degrees", "mm": "mm"}
 
 
-def look() -> AbstractContextManager[None]:
-    """A context within which figures look alike."""
-    return mpl.rc_context(_LOOK)
+def figure_style() -> AbstractContextManager[None]:
+    """Return a context in which matplotlib uses the style of all figures."""
+    return mpl.rc_context(_STYLE)
 
 
 def percent(rates: Iterable[Rate]) -> tuple[Array, Array]:
-    """N rates in percent, (N,), and how far their intervals reach below and above, (2, N)."""
+    """Return N rates (N,) and their error bars (2, N) below and above, in percent."""
     middle, low, high = 100 * np.array([(rate.rate, *rate.wilson95) for rate in rates]).T
-    return middle, np.maximum([middle - low, high - middle], 0.0)  # at 0 and 100 % they round
+    # At 0 and 100 % rounding can make a bar slightly negative.
+    return middle, np.maximum([middle - low, high - middle], 0.0)
 
 
 def check_name(path: Path) -> None:
-    """Refuse a name that is none of a PNG file.
+    """Check that a file name ends in .png.
 
     Raises:
-        UserError: it does not end in .png.
+        UserError: it does not.
     """
     if path.suffix.lower() != ".png":
         raise UserError(f"--out {path}: figures are PNG; name a file that ends in .png")
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG; the file appears under its name once it is whole.
+    """Write a figure as PNG; the file appears under its name only when it is complete.
 
     Raises:
-        UserError: it cannot be written there.
+        UserError: the file cannot be written.
     """
-    with look(), written_whole(path) as stream:
+    with figure_style(), written_whole(path) as stream:
         figure.savefig(stream, format="png")
 
 
 def label(name: str) -> str:
-    """A value of a situation for people: `object_y_m` is `object Y (m)`."""
+    """Return the label of a variable: `object_y_m` gives `object Y (m)`."""
     words, unit = words_and_unit(name)
     return f"{words} ({unit})" if unit else words
 
 
 def words_and_unit(name: str) -> tuple[str, str]:
-    """`object_y_m` is (`object Y`, `m`); the unit is empty where the name has none."""
+    """Split the name of a variable into words and unit: `object_y_m` gives (`object Y`, `m`).
+
+    The unit is empty if the name has none.
+    """
     *words, last = name.split("_")
     unit = _UNITS.get(last, "")
     if not unit or not words:

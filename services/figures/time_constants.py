@@ -1,4 +1,4 @@
-"""Success against the time constant of the PFC (paper, figure 5)."""
+"""Figure of success against the time constant of the PFC (paper, figure 5)."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from services.figures.style import BLACK, BLUE, GREY, look, percent
+from services.figures.style import BLACK, BLUE, GREY, figure_style, percent
 from services.terminal.rates import difference_text, percent_text, rate_text
 from services.trials.success import READINGS, Rate, Tally, difference95, pooled
 from services.trials.sweeps import RunOutcomes
 
 PAPER: Final[Mapping[float, Rate]] = {30.0: Rate(32, 52), 150.0: Rate(44, 52)}
-"""What the paper published; it counts what is lifted at the end, our `lenient`."""
-PAPERS_TAU: Final = 150.0
+"""Published rates by time constant; the paper's criterion of success is our `lenient`."""
+PAPER_TAU: Final = 150.0
+"""Time constant of the PFC in the paper's network."""
 
 Tallies = Mapping[float, Mapping[int, Tally]]
-"""What was counted by time constant and training seed."""
+"""Counted trials by time constant and training seed."""
 
 
 def tallies_of(tested: Sequence[RunOutcomes]) -> Tallies:
-    """Count the outcomes; both keys are in order."""
+    """Count the outcomes; time constants and seeds are in ascending order."""
     by_tau: dict[float, dict[int, Tally]] = defaultdict(dict)
     for each in sorted(tested, key=lambda each: (_tau(each), each.run.seed)):
         by_tau[_tau(each)][each.run.seed] = Tally.of(each.outcomes)
@@ -33,7 +34,7 @@ def tallies_of(tested: Sequence[RunOutcomes]) -> Tallies:
 
 
 def numbers(tallies: Tallies) -> dict[str, Any]:
-    """All that the figure shows, for `json.dumps`."""
+    """Return the numbers of the figure, for `json.dumps`."""
     return {
         "time_constants": [
             {
@@ -46,7 +47,7 @@ def numbers(tallies: Tallies) -> dict[str, Any]:
                 "against_150": {
                     reading: _against(tallies, tau, reading)
                     for reading in READINGS
-                    if PAPERS_TAU in tallies and tau != PAPERS_TAU
+                    if PAPER_TAU in tallies and tau != PAPER_TAU
                 },
             }
             for tau, by_seed in tallies.items()
@@ -58,10 +59,11 @@ def numbers(tallies: Tallies) -> dict[str, Any]:
 
 
 def table(tallies: Tallies) -> Table:
-    """Success by time constant, and whether 150 is better."""
+    """Return a table of success by time constant, and of the difference from 150."""
     result = Table(
-        caption="% of all seeds' trials, by seed, and in points against 150, each with its 95 %"
-        " interval; the intervals are of trials: how far networks differ, the seeds tell"
+        caption="% of the trials of all seeds with 95 % Wilson intervals, by seed, and difference"
+        " from 150 in points with its 95 % interval; the intervals cover the choice of trials, the"
+        " seeds show how networks differ"
     )
     for heading in ("tau", "reading", "all seeds", "by seed", "against 150"):
         result.add_column(heading, justify="right" if heading == "tau" else "left")
@@ -83,8 +85,8 @@ def table(tallies: Tallies) -> Table:
 
 
 def draw(tallies: Tallies) -> Figure:
-    """One panel for each reading of success, the paper's points beside ours."""
-    with look():
+    """Draw one panel for each reading of success, with the paper's rates beside ours."""
+    with figure_style():
         figure = Figure(figsize=(8.4, 3.2), layout="constrained")
         panels = figure.subplots(1, len(READINGS), sharey=True)
         for axes, reading in zip(panels, READINGS, strict=True):
@@ -117,26 +119,26 @@ def _draw_reading(axes: Axes, tallies: Tallies, reading: str) -> None:
     )
 
 
-def _draw_rates(axes: Axes, rates: Mapping[float, Rate], nudge: float, **look_of: Any) -> None:
+def _draw_rates(axes: Axes, rates: Mapping[float, Rate], offset: float, **style: Any) -> None:
     middle, reach = percent(rates.values())
     axes.errorbar(
-        np.array(list(rates)) + nudge,
+        np.array(list(rates)) + offset,
         middle,
         yerr=reach,
         markersize=4,
         elinewidth=0.9,
         capsize=2,
-        **look_of,
+        **style,
     )
 
 
 def _against(tallies: Tallies, tau: float, reading: str) -> dict[str, Any]:
-    rate, papers = (pooled(tallies[each].values(), reading) for each in (tau, PAPERS_TAU))
-    return {"difference": rate.rate - papers.rate, "interval95": list(difference95(rate, papers))}
+    rate, paper = (pooled(tallies[each].values(), reading) for each in (tau, PAPER_TAU))
+    return {"difference": rate.rate - paper.rate, "interval95": list(difference95(rate, paper))}
 
 
 def _against_text(tallies: Tallies, tau: float, reading: str) -> str:
-    if PAPERS_TAU not in tallies or tau == PAPERS_TAU:
+    if PAPER_TAU not in tallies or tau == PAPER_TAU:
         return ""
     found = _against(tallies, tau, reading)
     return difference_text(found["difference"], found["interval95"])

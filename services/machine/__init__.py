@@ -1,1 +1,1 @@
-"""What a run needs of this machine: driver, packages, ports."""
+"""Checks whether this machine has what a run needs: driver, packages, ports."""

@@ -1,4 +1,4 @@
-"""Checks this machine: what prevents a run or slows it down, and what to do about it."""
+"""Checks this machine for problems that prevent a run or slow it down, and advises what to do."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from proto.errors import UserError
 from services.machine.ports import port_trouble
 
 LOCK: Final = Path(__file__).parents[2] / "deploy" / "requirements.lock"
-"""The locked packages. Only a checkout has this file; an installed wheel does not."""
+"""File of the locked packages; it exists in a checkout, but not in an installed wheel."""
 DISTRIBUTION: Final = "vmdnn"
 """Name under which this project is installed."""
 
 PYTHONS: Final = ((3, 11), (3, 12))
-"""The Pythons for which the lock was made."""
+"""Python versions that the lock is made for."""
 
 CORES: Final = 2
-"""Usable processor cores that a run needs at least."""
+"""Least number of usable processor cores for a run."""
 MEMORY_GB: Final = 3.0
-"""Available memory that a run needs at least."""
+"""Least available memory for a run."""
 DISK_GB: Final = 5.0
-"""Free disk space that a run needs at least."""
+"""Least free disk space for a run."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What one check found.
+    """Result of one check.
 
     Attributes:
-        check: what was checked.
-        found: what was found.
-        advice: what to do about it; empty if there is no problem.
+        check: subject of the check.
+        found: the state that was found.
+        advice: what to do; empty if there is no problem.
     """
 
     check: str
@@ -56,7 +56,7 @@ class Finding:
 
 
 def examine(config: Config) -> Iterator[Finding]:
-    """Check everything that a run with this configuration needs, quickest checks first."""
+    """Check everything that a run with this configuration needs, fast checks first."""
     yield check_python()
     yield check_locked_packages(LOCK) if LOCK.exists() else check_required_packages(DISTRIBUTION)
     yield check_cores(len(os.sched_getaffinity(0)))
@@ -68,7 +68,7 @@ def examine(config: Config) -> Iterator[Finding]:
 
 
 def check_python() -> Finding:
-    """Check that this Python is one for which the lock was made."""
+    """Check that the lock is made for this version of Python."""
     found = f"Python {sys.version.split()[0]}"
     if sys.version_info[:2] in PYTHONS:
         return Finding("python", found)
@@ -97,13 +97,13 @@ def check_locked_packages(lock: Path) -> Finding:
 
 
 def check_required_packages(distribution: str) -> Finding:
-    """Check that what an installed distribution requires is installed, in versions that fit."""
+    """Check that the requirements of an installed distribution are installed, in right versions."""
     try:
         required = _requirements(distribution)
     except PackageNotFoundError:
         return Finding(
             "packages",
-            f"{distribution} is not installed, so what it requires is unknown",
+            f"{distribution} is not installed, so its requirements are unknown",
             f"install {distribution}'s wheel with pip, or run from a checkout of the repository",
         )
     if unmet := [requirement for requirement in required if not _is_met(requirement)]:
@@ -122,15 +122,15 @@ def check_cores(cores: int) -> Finding:
 
 
 def check_memory(available_gb: float) -> Finding:
-    """Check that learner, one actor and the services fit into memory."""
+    """Check that there is memory for the learner, one actor and the services."""
     found = f"{available_gb:.1f} GB available"
     if available_gb >= MEMORY_GB:
         return Finding("memory", found)
-    return Finding("memory", found, f"free some: a small run needs about {MEMORY_GB:.0f} GB")
+    return Finding("memory", found, f"free memory: a small run needs about {MEMORY_GB:.0f} GB")
 
 
 def check_disk(folder: Path) -> Finding:
-    """Check that there is room for a run's recordings."""
+    """Check that there is disk space for a run's recordings."""
     places = (folder.resolve(), *folder.resolve().parents)
     existing = next(place for place in places if place.exists())
     free_gb = shutil.disk_usage(existing).free / 1e9
@@ -150,7 +150,7 @@ def check_port(endpoint: str) -> Finding:
 
 
 def check_kernel() -> Finding:
-    """Check that the C++ kernels are or can be compiled for this machine's processor."""
+    """Check that the C++ kernels can be compiled for this machine; compile them if need be."""
     try:
         return Finding("kernel", f"compiled: {find_or_compile()}")
     except NotCompiledError as error:
@@ -162,7 +162,7 @@ def check_kernel() -> Finding:
 
 
 def check_graphics(config: SimulatorConfig) -> Finding:
-    """Check that the chosen backend can render, if pictures are wanted."""
+    """Check that the backend of the configuration can render, if the configuration renders."""
     if not config.render:
         return Finding("graphics", "not needed: simulator.render is false")
     try:
@@ -177,7 +177,7 @@ def check_graphics(config: SimulatorConfig) -> Finding:
 
 
 def read_lock(lock: Path) -> dict[str, str]:
-    """Version of each locked package by name."""
+    """Read the version of each locked package by name."""
     lines = (line.partition("#")[0].strip() for line in lock.read_text().splitlines())
     pairs = (line.partition("==") for line in lines if line)
     return {name: wanted for name, _, wanted in pairs}
@@ -191,7 +191,7 @@ def _installed(package: str) -> str | None:
 
 
 def _requirements(distribution: str) -> list[Requirement]:
-    """What a distribution requires on this machine, without its extras."""
+    """Return the requirements of a distribution on this machine, without its extras."""
     requirements = map(Requirement, requires(distribution) or ())
     return [one for one in requirements if one.marker is None or one.marker.evaluate({"extra": ""})]
 

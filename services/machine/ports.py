@@ -1,4 +1,4 @@
-"""Whether the hub could listen where it is told to."""
+"""Checks whether the hub can listen on its endpoint."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ import socket
 
 
 def port_trouble(endpoint: str) -> str | None:
-    """Why nothing can listen at an endpoint such as `tcp/127.0.0.1:7447`, and what to do.
+    """Check whether a process can listen on an endpoint such as `tcp/127.0.0.1:7447`.
 
-    None where it can.
+    Returns:
+        The problem and what to do; None if there is no problem.
     """
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
@@ -23,7 +24,7 @@ def port_trouble(endpoint: str) -> str | None:
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
             return (
-                f"hub.endpoint: {endpoint} is in use, perhaps by another run. Stop that one, or "
+                f"hub.endpoint: {endpoint} is in use, perhaps by another run. Stop that run, or "
                 f"choose another port with --set hub.endpoint={protocol}/{host}:PORT"
             )
         return (

@@ -1,4 +1,4 @@
-"""Recording tutored cases into a folder, to be resumed at any time."""
+"""Records tutored cases into a folder; an interrupted recording can be continued."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Case:
     """A situation to be tutored.
 
     Attributes:
-        name: what its files are called, the same whenever it is recorded.
-        number: index of a tutored case of the task, or the seed of a random one.
-        situation: what it is.
+        name: first part of the names of its files.
+        number: index of the tutored case of the task, or seed of the random situation.
+        situation: the values of the task's variables by name.
     """
 
     name: str
@@ -38,32 +38,32 @@ class Case:
 
     @classmethod
     def tutored(cls, task: Task, index: int) -> Self:
-        """One of the task's tutored cases."""
+        """Return one of the task's tutored cases."""
         return cls(f"case{index:02d}", index, task.tutored()[index])
 
     @classmethod
     def random(cls, task: Task, seed: int) -> Self:
-        """The situation that the task samples with a seed."""
+        """Return the situation that the task samples with a seed."""
         return cls(f"random{seed:06d}", seed, task.sample(seed))
 
 
 def parse_cases(text: str, task: Task, seed: int) -> list[Case]:
-    """Read which cases of a task are asked for.
+    """Parse a choice of cases of a task.
 
     Args:
         text: `all`, numbers and ranges such as `0,3,7-9`, or `random:40`.
         task: the task.
-        seed: random case i is what the task samples with seed + i, so that more of them are the
-            same ones and others.
+        seed: random case i is the situation that the task samples with seed + i. A larger number of
+            random cases therefore includes those of a smaller number.
 
     Raises:
-        UserError: it is none of these, or there is no such case.
+        UserError: the text has another form, or there is no such case.
     """
     kind, colon, count = text.partition(":")
     if kind != "random":
         return [Case.tutored(task, index) for index in _indices(text, len(task.tutored()))]
     if not colon or not count.isdecimal() or int(count) < 1:
-        raise UserError(f"--cases {text}: write how many, such as random:40")
+        raise UserError(f"--cases {text}: give the number of random cases, such as random:40")
     return [Case.random(task, seed + i) for i in range(int(count))]
 
 
@@ -85,7 +85,7 @@ def _indices(text: str, count: int) -> list[int]:
 
 
 def tutoring_jobs(config: Config, cases: Sequence[Case], folder: Path) -> list[Job]:
-    """The episodes of a folder: every case `config.tutor.repeats` times, the first time clean."""
+    """Make the jobs of a recording: each case `config.tutor.repeats` times, first without noise."""
     return [
         Job(
             situation=case.situation,
@@ -99,11 +99,11 @@ def tutoring_jobs(config: Config, cases: Sequence[Case], folder: Path) -> list[J
     ]
 
 
-def tutoring_jobs_again(store: TutoringStore, folder: Path) -> list[Job]:
-    """Jobs that tutor once more what the sequences of a store show, under the same names.
+def repeated_jobs(store: TutoringStore, folder: Path) -> list[Job]:
+    """Make jobs that repeat the tutoring of a store's sequences, with the same file names.
 
     Raises:
-        UserError: a sequence was not shown by the tutor alone, so it cannot be shown again.
+        UserError: a sequence was not played by the tutor alone, so it cannot be repeated.
     """
     jobs = []
     for name in store.ids:
@@ -112,8 +112,8 @@ def tutoring_jobs_again(store: TutoringStore, folder: Path) -> list[Job]:
             continue
         if episode.kind is not Kind.TUTORING or episode.policy != "tutor":
             raise UserError(
-                f"{name} in {store.folder} was not shown by the tutor alone, but by"
-                f" {episode.policy}; take sequences that `vmdnn tutor` recorded"
+                f"{name} in {store.folder} was played by {episode.policy}, not by the tutor alone;"
+                " use sequences that `vmdnn tutor` recorded"
             )
         jobs.append(
             Job(
@@ -130,12 +130,12 @@ def tutoring_jobs_again(store: TutoringStore, folder: Path) -> list[Job]:
 def record(
     config: Config, jobs: Sequence[Job], folder: Path, *, workers: int
 ) -> Generator[Episode, None, None]:
-    """Record what of `jobs` the folder lacks, and yield all their episodes.
+    """Play and record the jobs whose file is missing or damaged; yield the episodes of all jobs.
 
     Raises:
         UserError: the folder was recorded with another task, simulator or tutor.
     """
-    _claim(folder, config)
+    _save_or_check_config(folder, config)
     for part in parts_in(folder):
         part.unlink()
     missing = []
@@ -150,17 +150,17 @@ def record(
 
 
 def _recorded(job: Job) -> Episode | None:
-    """The episode of a job that was recorded before and is whole."""
+    """Read the recorded episode of a job; None if there is none or it is damaged."""
     if job.record_to is None or not job.record_to.exists():
         return None
     try:
         return read_episode(job.record_to)
     except UserError:
-        return None  # damaged: it is played again, and replaced once it is whole
+        return None  # damaged: the job is played again and replaces the file
 
 
-def _claim(folder: Path, config: Config) -> None:
-    """Save the configuration with the first recording, and keep to it with all others."""
+def _save_or_check_config(folder: Path, config: Config) -> None:
+    """Save the configuration in a new folder; check that it fits the one of an existing folder."""
     check_recorded(folder, config)
     saved = folder / "config.yaml"
     if not saved.exists():
@@ -168,23 +168,23 @@ def _claim(folder: Path, config: Config) -> None:
 
 
 def check_recorded(folder: Path, config: Config) -> None:
-    """Refuse a folder that says it was recorded with another task, simulator or tutor.
+    """Check that a folder's saved configuration has the same task, simulator and tutor.
 
     Raises:
-        UserError: it does; the message names each value.
+        UserError: it differs; the message names each value.
     """
     saved = folder / "config.yaml"
     if not saved.exists():
         return
-    before, now = _what_matters(load_config(saved)), _what_matters(config)
+    before, now = _recording_settings(load_config(saved)), _recording_settings(config)
     changed = [name for name in now if before[name] != now[name]]
     if changed:
-        told = ", ".join(f"{name} = {before[name]!r}, not {now[name]!r}" for name in changed)
-        raise UserError(f"{folder} was recorded with {told}; record to another folder")
+        values = ", ".join(f"{name} = {before[name]!r}, not {now[name]!r}" for name in changed)
+        raise UserError(f"{folder} was recorded with {values}; record to another folder")
 
 
-def _what_matters(config: Config) -> dict[str, Any]:
-    """The settings that make a tutored episode what it is."""
+def _recording_settings(config: Config) -> dict[str, Any]:
+    """Return the settings that determine a tutored episode."""
     sections = config.model_dump(mode="json", include={"task", "simulator", "tutor"})
     return {
         f"{section}.{name}": value

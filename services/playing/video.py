@@ -1,4 +1,4 @@
-"""A recorded episode as a video: the scene from outside beside what the eye sees."""
+"""Renders a recorded episode as a video: an outside view of the scene beside the eye image."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ def write_video(
 ) -> None:
     """Render every step of a recorded episode into an MP4 file.
 
-    Nothing is simulated: the recorded joints and bodies are put on the stage, step by step.
+    Nothing is simulated: the simulator shows the recorded joints and bodies of each step.
 
     Args:
-        episode: what was recorded.
-        out: the file; it appears under its name once it is whole.
+        episode: the recorded episode.
+        out: the file to write; it appears under its name only when it is complete.
         config: the simulator that renders, and options of the task.
-        fps: frames, which are control steps, per second; None: as fast as it was.
+        fps: frames per second, one frame for each control step; None for real time.
         on_frame: called after each frame.
 
     Raises:
@@ -72,7 +72,7 @@ def write_video(
 
 
 def frames(episode: Episode, simulator: Simulator, task: Task) -> Iterator[Picture]:
-    """Pictures (480, 1280, 3) uint8, red green blue, one for each step of an episode of a task."""
+    """Yield one picture (480, 1280, 3) uint8, RGB, for each step of an episode of a task."""
     scene = task.scene(episode.situation)
     simulator.reset(scene)
     boxes = {box.name for box in scene.boxes}
@@ -84,8 +84,8 @@ def frames(episode: Episode, simulator: Simulator, task: Task) -> Iterator[Pictu
         _write_lines(outside, _caption(episode, step))
         focus = _focus_before(episode, step, float(task.start[FOCUS]))
         eye = simulator.eye_picture(Crop(), PANEL_WIDTH, PANEL_HEIGHT).copy()
-        _frame_focus(eye, focus)
-        _show_seen(eye, episode.images[step])
+        _draw_focus(eye, focus)
+        _insert_recorded_image(eye, episode.images[step])
         yield np.hstack([outside, eye])
 
 
@@ -98,8 +98,8 @@ def _poses(episode: Episode, step: int) -> Mapping[str, Pose]:
     return poses
 
 
-def _frame_focus(eye: Picture, focus: float) -> None:
-    """Frame what the focus level leaves of the whole eye image."""
+def _draw_focus(eye: Picture, focus: float) -> None:
+    """Draw a rectangle around the crop of the focus level."""
     crop = crop_of_focus(focus)
     across, down = crop.width / EYE_WIDTH / 2, crop.height / EYE_HEIGHT / 2
     corner = (round(PANEL_WIDTH * (0.5 - across)), round(PANEL_HEIGHT * (0.5 - down)))
@@ -108,15 +108,15 @@ def _frame_focus(eye: Picture, focus: float) -> None:
     _write_lines(eye, [f"left eye, focus {focus:.0f}"])
 
 
-def _show_seen(eye: Picture, image: Picture) -> None:
-    """Put the recorded picture, the one that the policy was given, into the lower right corner."""
-    seen = cv2.resize(image, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST)
-    rim = cv2.copyMakeBorder(seen, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=_WHITE)
-    eye[-rim.shape[0] :, -rim.shape[1] :] = rim[..., None]
+def _insert_recorded_image(eye: Picture, image: Picture) -> None:
+    """Insert the recorded image, which the policy saw, into the lower right corner."""
+    enlarged = cv2.resize(image, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST)
+    framed = cv2.copyMakeBorder(enlarged, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=_WHITE)
+    eye[-framed.shape[0] :, -framed.shape[1] :] = framed[..., None]
 
 
 def _focus_before(episode: Episode, step: int, start: float) -> float:
-    """The focus level through which images[step] was seen: that of the action before."""
+    """Return the focus level at which images[step] was taken: that of the action before."""
     return start if step == 0 else float(episode.actions[step - 1, FOCUS])
 
 
@@ -141,7 +141,7 @@ def _in_words(outcome: Outcome) -> str:
 
 
 def _write_lines(picture: Picture, lines: Sequence[str]) -> None:
-    """White text on a darkened band along the top."""
+    """Write lines of white text on a darkened band at the top of the picture."""
     band = picture[: len(lines) * _LINE + _MARGIN]
     band //= 2
     for number, line in enumerate(lines, 1):
@@ -151,7 +151,10 @@ def _write_lines(picture: Picture, lines: Sequence[str]) -> None:
 
 @contextmanager
 def _video_file(out: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
-    """Encode pictures elsewhere, and put the file where it belongs once it is whole."""
+    """Open a video file to write pictures to.
+
+    The video is encoded in a temporary folder and copied to `out` when it is complete.
+    """
     if out.suffix != ".mp4":
         raise UserError(f"{out}: the video's name must end in .mp4")
     with tempfile.TemporaryDirectory() as folder:

@@ -1,7 +1,6 @@
-"""Plays many episodes, on as many processes as there are cores.
+"""Plays many episodes in several worker processes.
 
-Episodes know nothing of each other, so the same jobs give the same episodes with any number of
-workers.
+Episodes are independent: the same jobs give the same episodes with any number of workers.
 """
 
 from __future__ import annotations
@@ -36,12 +35,12 @@ class Job:
     """One episode to be played.
 
     Attributes:
-        situation: what to play.
-        seed: seed of everything random in it.
-        kind: why it is played.
-        noisy: the tutor's execution is disturbed; for the tutor only.
-        record_to: file to write it to, or None.
-        states: the episode carries the activity of the policy's subnets; for a network only.
+        situation: the values of the task's variables by name.
+        seed: seed of all random numbers in the episode.
+        kind: why the episode is played.
+        noisy: add noise to the tutor's execution; only for the tutor.
+        record_to: file to record the episode to, or None.
+        states: store the activity of the policy's subnets in the episode; only for networks.
     """
 
     situation: Situation
@@ -55,19 +54,20 @@ class Job:
 def play_all(
     config: Config, policy: str, jobs: Sequence[Job], *, workers: int
 ) -> Generator[tuple[Job, Episode], None, None]:
-    """Play jobs and yield each with its episode as it is finished, in any order.
+    """Play jobs and yield each with its episode when it is finished, in any order.
 
-    Closing the iterator, or an interrupt, lets the episodes that are being played come to their end
-    and starts no other.
+    If the iterator is closed or interrupted, the running episodes are finished and no other is
+    started.
 
     Args:
         config: the whole configuration.
         policy: a name for `actors.policies.by_name.make_policy`.
-        jobs: what to play.
-        workers: processes to play in; 1 plays in this one.
+        jobs: the episodes to play.
+        workers: number of processes; with 1 the episodes are played in this process.
 
     Raises:
-        UserError: a worker could not play, or died, or the policy has no states to carry.
+        UserError: a worker could not play or died, or a job requests states of a policy that has
+            none.
     """
     if workers <= 1 or len(jobs) <= 1:
         player = _Player(config, policy)
@@ -75,18 +75,19 @@ def play_all(
         return
     waiting = iter(jobs)
     with _pool(min(workers, len(jobs)), config, policy) as pool:
-        with _interrupts_ignored():  # the workers that start here go on ignoring them
-            running = {pool.submit(_play_here, job): job for job in islice(waiting, workers)}
+        with _interrupts_ignored():  # workers that start here inherit this
+            running = {pool.submit(_play_in_worker, job): job for job in islice(waiting, workers)}
         try:
             while running:
                 done, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in done:
                     job = running.pop(future)
-                    running |= {pool.submit(_play_here, job): job for job in islice(waiting, 1)}
+                    for next_job in islice(waiting, 1):
+                        running[pool.submit(_play_in_worker, next_job)] = next_job
                     yield job, future.result()
         except BrokenProcessPool as error:
             raise UserError(
-                "a worker process died; if memory is short, try fewer --workers"
+                "a worker process died; if there is too little memory, use fewer --workers"
             ) from error
 
 
@@ -103,8 +104,8 @@ class _Player:
 
     def play(self, job: Job) -> Episode:
         policy = self._policy_for(job)
-        inside = _with_states(policy) if job.states else None
-        # Nobody looks at pictures that are neither seen by the policy nor kept.
+        stateful = _check_stateful(policy) if job.states else None
+        # Pictures are needed only if the policy uses them or they are recorded.
         simulator = self._simulator(render=policy.looks or job.record_to is not None)
         episode = play(
             simulator,
@@ -115,8 +116,8 @@ class _Player:
             kind=job.kind,
             config_digest=self._digest,
         )
-        if inside is not None:
-            episode = replace(episode, states=inside.states(episode.images))
+        if stateful is not None:
+            episode = replace(episode, states=stateful.states(episode.images))
         if job.record_to is not None:
             write_episode(job.record_to, episode)
         return episode
@@ -137,14 +138,14 @@ class _Player:
         return self._simulators[render]
 
 
-def _with_states(policy: Policy) -> StatefulPolicy:
+def _check_stateful(policy: Policy) -> StatefulPolicy:
     if not isinstance(policy, StatefulPolicy):
-        raise UserError(f"policy {policy.name!r} has no states; only a network's checkpoint has")
+        raise UserError(f"policy {policy.name!r} has no states; only networks have states")
     return policy
 
 
 def _pool(workers: int, config: Config, policy: str) -> ProcessPoolExecutor:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # torch starts so many threads in each worker
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # number of torch's threads in each worker
     return ProcessPoolExecutor(
         workers,
         mp_context=multiprocessing.get_context("spawn"),
@@ -170,8 +171,8 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _play_here(job: Job) -> Episode:
-    # Made by the first job, not by the initializer, so that a UserError reaches the caller.
+def _play_in_worker(job: Job) -> Episode:
+    # The first job makes the player, not the initializer, so that a UserError reaches the caller.
     global _player  # noqa: PLW0603
     if _player is None:
         _player = _Player(*_arguments)
@@ -180,7 +181,7 @@ def _play_here(job: Job) -> Episode:
 
 @contextmanager
 def _interrupts_ignored() -> Iterator[None]:
-    """Ctrl-C reaches every process of a terminal; workers leave it to the parent."""
+    """Ignore Ctrl-C, which reaches every process of a terminal; the parent handles it."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield

@@ -1,1 +1,1 @@
-"""Trials: played, counted, and compared between networks."""
+"""Plays and counts trials, and compares networks by them."""

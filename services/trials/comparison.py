@@ -16,7 +16,7 @@ from learner.tutoring.store import TutoringStore
 from proto.config import Config
 from proto.episode import Episode
 from proto.errors import UserError
-from services.playing.tutoring import check_recorded, record, tutoring_jobs_again
+from services.playing.tutoring import check_recorded, record, repeated_jobs
 from services.terminal.rates import percent_text, rate_text
 from services.trials.success import READINGS, Tally, difference95, pooled
 from services.trials.sweeps import RunOutcomes, Variant, training_s
@@ -40,7 +40,7 @@ CONTENDERS: Final[Mapping[str, Callable[[str, Config], Variant]]] = {
     "cnn-lstm": lambda name, config: Variant(name, config, rival="cnn-lstm"),
     "feed-forward": lambda name, config: Variant(name, config, rival="feed-forward"),
 }
-"""What is compared: VMDNN, then VMDNN without one of its parts, then other networks."""
+"""The networks to compare: VMDNN, variants of VMDNN, and networks of other kinds."""
 
 
 def variants(config: Config, names: Sequence[str]) -> list[Variant]:
@@ -54,7 +54,7 @@ def weights(variant: Variant) -> int:
     return weights_of(make_recipe(variant.config, variant.rival, questions).network)
 
 
-def tutored_again(
+def repeat_tutoring(
     store: TutoringStore, variant: Variant, active: Config, folder: Path, *, workers: int
 ) -> Generator[Episode, None, None]:
     """Repeat the tutoring in a store, its cases and noise, with a variant's config.
@@ -74,7 +74,7 @@ def tutored_again(
     """
     task = {"task.name": _task_of(store)}
     check_recorded(store.folder, Variant.of("data", active, task).config)
-    jobs = tutoring_jobs_again(store, folder)
+    jobs = repeated_jobs(store, folder)
     config = Variant.of(variant.name, variant.config, task).config
     return record(config, jobs, folder, workers=workers)
 
@@ -162,7 +162,7 @@ def table(found: Sequence[Score]) -> Table:
 
 
 def _against_vmdnn(found: Sequence[Score], each: Score) -> dict[str, Any]:
-    """By how much its rates exceed VMDNN's; empty for VMDNN, and if VMDNN was not tested."""
+    """Return its rates minus those of VMDNN; empty for VMDNN, and if VMDNN was not tested."""
     vmdnn = next((other for other in found if other.variant.name == VMDNN), None)
     if vmdnn is None or vmdnn is each:
         return {}

@@ -1,4 +1,4 @@
-"""Testing a policy on situations that were never tutored."""
+"""Jobs and result of testing a policy in situations that were not tutored."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from services.trials.success import Tally
 
 
 def trial_jobs(config: Config, trials: int, seed: int, folder: Path | None = None) -> list[Job]:
-    """Trials 0, 1, ... of a seed: the same situations for every policy and backend.
+    """Make the jobs of trials in random situations, which are the same for every policy.
 
     Args:
-        config: names the task.
-        trials: how many.
+        config: the configuration, which names the task.
+        trials: number of trials.
         seed: trial i plays the situation that the task samples with seed + i.
-        folder: where rollouts are recorded, or None.
+        folder: folder in which rollouts are recorded, or None.
     """
     task = make_task(config.task)
     return situation_jobs([task.sample(seed + trial) for trial in range(trials)], seed, folder)
@@ -30,7 +30,7 @@ def trial_jobs(config: Config, trials: int, seed: int, folder: Path | None = Non
 def situation_jobs(
     situations: Sequence[Situation], seed: int, folder: Path | None = None
 ) -> list[Job]:
-    """Trials of given situations; trial i has the seed seed + i."""
+    """Make the jobs of trials in given situations; trial i has the seed `seed` + i."""
     return [
         Job(
             situation=situation,
@@ -43,7 +43,7 @@ def situation_jobs(
 
 
 def result_json(config: Config, policy: str, tally: Tally, wall_s: float) -> dict[str, Any]:
-    """What an evaluation found, for `json.dumps`."""
+    """Return the result of an evaluation, for `json.dumps`."""
     return {
         "policy": policy,
         "task": config.task.name,

@@ -1,4 +1,4 @@
-"""Counting what succeeded, in the three readings of success, with honest intervals."""
+"""Success rates in the three readings of success, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _Z95: Final = 1.959963984540054  # 97.5 % quantile of the normal distribution
 
 
 def wilson95(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson score interval at 95 % for a success rate; (0, 1) where nothing was tried."""
+    """Return the 95 % Wilson score interval of a success rate; (0, 1) without trials."""
     if not trials:
         return 0.0, 1.0
     rate = successes / trials
@@ -29,34 +29,37 @@ def wilson95(successes: int, trials: int) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Rate:
-    """How many of the trials succeeded in one reading."""
+    """Number of trials, and how many of them succeeded in one reading."""
 
     successes: int
     trials: int
 
     @property
     def rate(self) -> float:
-        """Share of the trials that succeeded, 0 where nothing was tried."""
+        """Fraction of the trials that succeeded; 0 without trials."""
         return self.successes / self.trials if self.trials else 0.0
 
     @property
     def wilson95(self) -> tuple[float, float]:
-        """Interval that holds the true rate with 95 % confidence."""
+        """95 % Wilson score interval of the rate."""
         return wilson95(self.successes, self.trials)
 
     def as_json(self) -> dict[str, Any]:
-        """For `json.dumps`."""
+        """Return successes, rate and interval, for `json.dumps`."""
         return {"successes": self.successes, "rate": self.rate, "wilson95": list(self.wilson95)}
 
 
 def pooled(tallies: Iterable[Tally], reading: str) -> Rate:
-    """The rate over the trials of several tallies."""
+    """Return the rate over the trials of several tallies."""
     rates = [tally.rate(reading) for tally in tallies]
     return Rate(sum(rate.successes for rate in rates), sum(rate.trials for rate in rates))
 
 
 def difference95(one: Rate, other: Rate) -> tuple[float, float]:
-    """Newcombe's interval at 95 % for how much higher the rate of `one` is, from Wilson's."""
+    """Return Newcombe's 95 % interval of the rate of `one` minus that of `other`.
+
+    It is computed from the Wilson intervals of both rates.
+    """
     difference = one.rate - other.rate
     (one_low, one_high), (other_low, other_high) = one.wilson95, other.wilson95
     return (
@@ -67,12 +70,12 @@ def difference95(one: Rate, other: Rate) -> tuple[float, float]:
 
 @dataclass
 class Tally:
-    """Outcomes counted by reading, and by why they fell short of `precise`.
+    """Counted outcomes.
 
     Attributes:
-        trials: how many were counted.
-        successes: how many succeeded, by reading.
-        reasons: how many fell short, by reason; a reason that never applied is not there.
+        trials: number of counted outcomes.
+        successes: number of successes by reading.
+        reasons: number of outcomes that were not precise, by reason.
     """
 
     trials: int = 0
@@ -81,24 +84,24 @@ class Tally:
 
     @classmethod
     def of(cls, outcomes: Iterable[Outcome]) -> Tally:
-        """Count some outcomes."""
+        """Count outcomes."""
         tally = cls()
         for outcome in outcomes:
             tally.add(outcome)
         return tally
 
     def add(self, outcome: Outcome) -> None:
-        """Count one more."""
+        """Count one more outcome."""
         self.trials += 1
         self.successes.update(reading for reading in READINGS if getattr(outcome, reading))
         if outcome.reason != NO_FAILURE:
             self.reasons[outcome.reason] += 1
 
     def rate(self, reading: str) -> Rate:
-        """The rate in one of READINGS."""
+        """Return the success rate in one of READINGS."""
         return Rate(self.successes[reading], self.trials)
 
     def as_json(self) -> dict[str, Any]:
-        """`trials`, each reading's rate, and `reasons`, for `json.dumps`."""
+        """Return `trials`, the rate of each reading, and `reasons`, for `json.dumps`."""
         rates = {reading: self.rate(reading).as_json() for reading in READINGS}
         return {"trials": self.trials, **rates, "reasons": dict(self.reasons)}

@@ -1,4 +1,4 @@
-"""Every trial that was counted, on disk: one line of JSON each."""
+"""The trial log: a file with one line of JSON for each counted trial."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from proto.variables import SituationField
 LOG = logging.getLogger(__name__)
 
 FORMAT: Final = 2
-"""Format of the lines that are written; those of format 1 can be read, too."""
+"""Format of the lines that are written; lines of format 1 can be read too."""
 
 
 @message("counted_trial", 2, form="json")
@@ -39,11 +39,11 @@ class CountedTrial:
     """One line of the log.
 
     Attributes:
-        run_id: training that the policy comes from.
-        policy_version: its version.
-        seed: seed of the situation; it tells one trial of a version from another.
+        run_id: id of the training that the policy comes from.
+        policy_version: version of the policy.
+        seed: seed of the situation; it identifies the trial of a policy version.
         episode: id of the episode.
-        actor: who played it.
+        actor: id of the process that played it.
         situation: the values of the task's variables by name.
         outcome: how it ended.
         format: format of the line.
@@ -60,7 +60,7 @@ class CountedTrial:
 
     @classmethod
     def of(cls, episode: Episode, run_id: str) -> CountedTrial:
-        """The line of an episode that was played with a policy of the training run_id."""
+        """Make the line of an episode, played with a policy of the training `run_id`."""
         return cls(
             run_id=run_id,
             policy_version=episode.policy_version,
@@ -72,33 +72,34 @@ class CountedTrial:
         )
 
     def line(self) -> bytes:
-        """One line of JSON."""
+        """Return the line of JSON, with a line break at its end."""
         return encode(self).payload + b"\n"
 
 
 def read_trials(path: Path) -> list[CountedTrial]:
-    """All lines of a book, or of what `vmdnn evaluate --outcomes` wrote.
+    """Read all trials of a trial log, or of a file that `vmdnn evaluate --outcomes` wrote.
 
     Raises:
-        UserError: the file cannot be read, or a line of it is none of a book.
+        UserError: the file cannot be read, or a line is not a counted trial.
     """
     try:
         lines = path.read_bytes().splitlines()
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     try:
-        return [_trial(line) for line in lines]
+        return [_parse_line(line) for line in lines]
     except MessageError as error:
         raise UserError(
-            f"{path} holds no outcomes of trials ({error}); `vmdnn evaluate --outcomes FILE` does"
+            f"{path} is not a file of counted trials ({error});"
+            " `vmdnn evaluate --outcomes FILE` writes one"
         ) from error
 
 
-def _trial(line: bytes) -> CountedTrial:
-    """The trial of a line, which may be of format 1.
+def _parse_line(line: bytes) -> CountedTrial:
+    """Parse a line of format 1 or 2.
 
     Raises:
-        MessageError: it is no such line, or one of a newer format.
+        MessageError: the line is not a counted trial, or its format is newer.
     """
     encoding = schema_of(CountedTrial).encoding
     try:
@@ -110,7 +111,7 @@ def _trial(line: bytes) -> CountedTrial:
             values["format"] = FORMAT
             line = json.dumps(values).encode()
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise MessageError("payload", f"is no counted trial: {error!r:.128}") from error
+        raise MessageError("payload", f"is not a counted trial: {error!r:.128}") from error
     if isinstance(number, int) and number > FORMAT:
         raise MessageError(
             "format",
@@ -121,10 +122,13 @@ def _trial(line: bytes) -> CountedTrial:
 
 
 class TrialLog:
-    """Counts each trial of each policy version once, whatever is restarted."""
+    """Counts each trial of each policy version once, also across restarts."""
 
     def __init__(self, path: Path) -> None:
-        """Open a book, or begin it. A line that a killed process did not finish is dropped."""
+        """Open a trial log, or create it.
+
+        A last line that is incomplete, because a process was killed, is dropped.
+        """
         self._path = path
         self._outcomes: dict[tuple[str, int], dict[int, Outcome]] = defaultdict(dict)
         if drop_unfinished_line(path):
@@ -134,19 +138,18 @@ class TrialLog:
             self._read(line, number)
 
     def add(self, rollout: Rollout) -> bool:
-        """Count a trial, on disk first; False if it was counted before.
+        """Write a trial to disk and count it.
+
+        Returns:
+            False if the trial was counted before; then nothing changes.
 
         Raises:
-            UserError: it cannot be written; then it is not counted.
+            UserError: the file cannot be written; the trial is not counted.
         """
         return self._add(CountedTrial.of(rollout.episode, rollout.run_id))
 
     def add_failure(self, report: EpisodeFailed) -> bool:
-        """Count a trial whose simulation failed as a failure; False if it was counted before.
-
-        Raises:
-            UserError: it cannot be written; then it is not counted.
-        """
+        """Count a trial whose simulation failed as a failure; otherwise as `add`."""
         return self._add(
             CountedTrial(
                 run_id=report.training,
@@ -160,12 +163,12 @@ class TrialLog:
         )
 
     def versions(self, run_id: str) -> list[int]:
-        """Policy versions of a training that were tried, oldest first."""
-        tried = list(self._outcomes)  # a copy: the other thread may add to it
-        return sorted(version for run, version in tried if run == run_id)
+        """Return the policy versions of a training with counted trials, oldest first."""
+        keys = list(self._outcomes)  # a copy, because another thread may add to it
+        return sorted(version for run, version in keys if run == run_id)
 
     def outcomes(self, run_id: str, policy_version: int) -> Mapping[int, Outcome]:
-        """Outcomes of a policy version by the trial's seed."""
+        """Return the outcomes of a policy version by the trial's seed."""
         return dict(self._outcomes.get((run_id, policy_version), {}))
 
     def _add(self, trial: CountedTrial) -> bool:
@@ -182,6 +185,6 @@ class TrialLog:
 
     def _read(self, line: bytes, number: int) -> None:
         try:
-            self._count(_trial(line))
+            self._count(_parse_line(line))
         except MessageError as error:
             LOG.warning("%s, line %d is not counted: %s", self._path, number, error)

@@ -1,4 +1,4 @@
-"""Playing the trials of a policy that a trial log has not counted yet."""
+"""Plays the trials of a policy that are not in its trial log yet."""
 
 from __future__ import annotations
 
@@ -40,16 +40,19 @@ def play_missing_trials(
     workers: int,
     on_trial: Callable[[], None],
 ) -> list[Outcome]:
-    """Play the trials of a policy that are not in its log yet; the outcomes of all of them.
+    """Play the trials of a policy that are not in its log; return the outcomes of all its trials.
 
     Args:
         log_file: the trial log; trials that are played are added to it.
         policy: the policy.
-        config: names task and simulator.
+        config: the configuration, which names task and simulator.
         trials: number of trials.
-        seed: seed of the first; the same trials and seed give every policy the same situations.
-        workers: processes to play in.
+        seed: seed of the first trial; the same seed gives every policy the same situations.
+        workers: number of processes.
         on_trial: called for each trial, also for those in the log.
+
+    Raises:
+        UserError: see `play_all`.
     """
     log = TrialLog(log_file)
     logged = log.outcomes(policy.run_id, policy.version)

@@ -77,7 +77,7 @@ def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> N
     with started(tmp_path) as process:
         output, errors = process.communicate(timeout=240)
         assert process.returncode == 0, errors
-        assert "going on with run smoke" in output
+        assert "continuing run smoke" in output
         assert "4 policy versions" in output
         assert "policy 4, 10 of 10 trials counted" in output
         assert not processes_that_name(str(tmp_path))
@@ -94,7 +94,7 @@ def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> N
     with started(tmp_path, "--set", "network.pfc.units=7") as process:
         output, errors = process.communicate(timeout=60)
         assert process.returncode == 2, output
-        assert "learner cannot go on" in errors
+        assert "learner has ended and is not started again" in errors
         assert not processes_that_name(str(tmp_path))
     assert load_config(run / "config.yaml") == config
     assert len(list(run.glob("policies/*.safetensors"))) == 4
@@ -180,18 +180,18 @@ def state(tmp_path: Path, **given: object) -> ProcessState:
 
 def test_a_crash_now_and_then_is_told_and_forgiven(tmp_path: Path) -> None:
     crashes = Crashes()
-    assert crashes.look([state(tmp_path, started_s=0)]) == []
+    assert crashes.update([state(tmp_path, started_s=0)]) == []
     for hour in range(1, 3 * TOO_MANY_CRASHES):
-        back = crashes.look([state(tmp_path, started_s=3600 * hour)])
+        back = crashes.update([state(tmp_path, started_s=3600 * hour)])
         assert bool(back) == (hour > 1), "the first start is no crash"
-        assert crashes.look([state(tmp_path, started_s=3600 * hour)]) == []
+        assert crashes.update([state(tmp_path, started_s=3600 * hour)]) == []
 
 
 def test_crashing_again_and_again_ends_the_run(tmp_path: Path) -> None:
     (tmp_path / "actor-1.log").write_text("one\nno such luck\n")
     crashes = Crashes()
     for second in range(TOO_MANY_CRASHES):
-        crashes.look([state(tmp_path, started_s=100 + second)])
+        crashes.update([state(tmp_path, started_s=100 + second)])
     with pytest.raises(ProcessFailedError, match="no such luck") as failure:
-        crashes.look([state(tmp_path, started_s=100 + TOO_MANY_CRASHES)])
+        crashes.update([state(tmp_path, started_s=100 + TOO_MANY_CRASHES)])
     assert failure.value.exit_status == 1

@@ -1,1 +1,1 @@
-"""One module for each figure: `SUMMARY`, `configure(parser)` and `run(arguments)`."""
+"""One module for each figure: `SUMMARY`, `configure(parser)` and `draw(arguments)`."""

@@ -13,7 +13,7 @@ from proto.errors import UserError
 from proto.recordings.episodes import read_episode
 from services.arguments.common import add_config, config_of
 from services.figures import activity
-from services.figures.drawn import Drawn
+from services.figures.figure_result import FigureResult
 
 SUMMARY: Final = "units and outputs of the network over time (paper, figure 4)"
 
@@ -25,16 +25,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--rollouts", type=Path, nargs="+", required=True, metavar="MCAP", help="recorded rollouts"
     )
     parser.add_argument(
-        "--policy", help="checkpoint that played them, where they carry no states themselves"
+        "--policy", help="checkpoint that played the rollouts; needed if they have no states"
     )
 
 
-def draw(arguments: argparse.Namespace) -> Drawn:
+def draw(arguments: argparse.Namespace) -> FigureResult:
     """Read the rollouts and draw them side by side."""
     policy = None if arguments.policy is None else _stateful_policy(arguments)
     episodes = [read_episode(path) for path in arguments.rollouts]
     activities = [activity.activity_of(episode, policy) for episode in episodes]
-    return Drawn(
+    return FigureResult(
         activity.draw(activities), activity.numbers(activities), activity.table(activities)
     )
 

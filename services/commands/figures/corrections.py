@@ -14,13 +14,13 @@ from proto.seeds import TRIALS_BELOW
 from services.arguments.common import positive, seed
 from services.figures import corrections
 from services.figures.corrections import Curve
-from services.figures.drawn import Drawn
+from services.figures.figure_result import FigureResult
 from services.terminal.progress import progress_bar
 from services.trials.round_trials import Run, open_run
 from services.trials.success import Tally
 from services.trials.trial_playing import play_missing_trials
 
-SUMMARY: Final = "success against the number of tutored cases, as policies are corrected"
+SUMMARY: Final = "success against the number of tutored cases, after each round of corrections"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -38,12 +38,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def draw(arguments: argparse.Namespace) -> Drawn:
-    """Test what was not tested yet, then draw all."""
+def draw(arguments: argparse.Namespace) -> FigureResult:
+    """Test the policies that were not tested yet, then draw the success of all."""
     if arguments.seed + arguments.trials > TRIALS_BELOW:
         raise UserError(
-            f"--seed {arguments.seed}: with seeds of {TRIALS_BELOW} and more a run may have been"
-            " tutored; take a smaller one"
+            f"--seed {arguments.seed}: the run may have been tutored in situations with seeds from"
+            f" {TRIALS_BELOW} on; choose a smaller seed"
         )
     runs = [open_run(folder) for folder in arguments.runs]
     try:
@@ -51,10 +51,10 @@ def draw(arguments: argparse.Namespace) -> Drawn:
     except KeyboardInterrupt:
         console = Console(stderr=True)
         console.print(
-            "stopped; the same command goes on with what was counted in the runs' folders"
+            "stopped; the same command continues with the trials counted in the runs' folders"
         )
         raise
-    return Drawn(
+    return FigureResult(
         corrections.draw(curves),
         {
             "trials": arguments.trials,

@@ -12,10 +12,10 @@ from proto.errors import UserError
 from proto.recordings.episodes import read_episode
 from services.arguments.common import add_config, config_of
 from services.figures import failures
-from services.figures.drawn import Drawn
+from services.figures.figure_result import FigureResult
 from services.trials.trial_log import CountedTrial, read_trials
 
-SUMMARY: Final = "where a policy fails, and how it errs at the grasp"
+SUMMARY: Final = "situations in which a policy fails, and its errors at the grasp"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -27,7 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="FILE",
-        help="what `vmdnn evaluate --outcomes` wrote, or evaluation/trials.jsonl of a run",
+        help="file of `vmdnn evaluate --outcomes`, or evaluation/trials.jsonl of a run",
     )
     parser.add_argument(
         "--rollouts", type=Path, nargs="+", default=[], metavar="DIR", help="folders of rollouts"
@@ -35,8 +35,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--policy-version", type=int, help="only trials of this version")
 
 
-def draw(arguments: argparse.Namespace) -> Drawn:
-    """Read the trials of one policy and draw where they failed."""
+def draw(arguments: argparse.Namespace) -> FigureResult:
+    """Read the trials of one policy and draw the situations in which it failed."""
     found = [
         trial
         for trial in _counted_trials(arguments)
@@ -45,7 +45,7 @@ def draw(arguments: argparse.Namespace) -> Drawn:
     trials = failures.Trials.of(found, make_task(config_of(arguments).task))
     name, version = _only_policy(found)
     words = f"{name} version {version}" if version else name
-    return Drawn(
+    return FigureResult(
         failures.draw(trials, f"{words}: {len(found)} trials"),
         {"policy": name, "policy_version": version, **failures.numbers(trials)},
         failures.table(trials),
@@ -66,6 +66,6 @@ def _counted_trials(arguments: argparse.Namespace) -> Iterator[CountedTrial]:
 def _only_policy(trials: list[CountedTrial]) -> tuple[str, int]:
     policies = sorted({(trial.run_id, trial.policy_version) for trial in trials})
     if len(policies) > 1:
-        told = ", ".join(f"{name} version {version}" for name, version in policies)
-        raise UserError(f"these are trials of {told}; choose one, with --policy-version")
+        names = ", ".join(f"{name} version {version}" for name, version in policies)
+        raise UserError(f"these are trials of {names}; choose one with --policy-version")
     return policies[0]

@@ -9,14 +9,14 @@ from typing import Final
 from proto.errors import UserError
 from services.arguments.common import positive
 from services.figures import gestures
-from services.figures.drawn import Drawn
+from services.figures.figure_result import FigureResult
 from sim_assets.gestures.clip import GestureLibrary
 from sim_assets.gestures.drawing import DrawnGestures
 from sim_assets.gestures.videos import GestureVideoError, RecordedGestures
 
 SUMMARY: Final = "contact sheet of the clips in which a person points (Experiment II)"
 TAKES: Final = 10
-"""Takes of a drawn subject, as many as in the paper."""
+"""Number of takes of a drawn subject, as in the paper."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--subjects",
         type=positive,
         default=8,
-        help="how many drawn subjects to show; of a single one, all takes are shown",
+        help="number of drawn subjects to show; for a single one, all takes are shown",
     )
     source.add_argument(
         "--gestures",
@@ -36,10 +36,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def draw(arguments: argparse.Namespace) -> Drawn:
-    """Draw or read the clips, and put them on a sheet."""
+def draw(arguments: argparse.Namespace) -> FigureResult:
+    """Draw or read the clips and arrange them on a sheet."""
     rows = gestures.rows_of(_library(arguments))
-    return Drawn(gestures.draw(rows), gestures.numbers(rows), gestures.table(rows))
+    return FigureResult(gestures.draw(rows), gestures.numbers(rows), gestures.table(rows))
 
 
 def _library(arguments: argparse.Namespace) -> GestureLibrary:

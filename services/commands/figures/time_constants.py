@@ -10,7 +10,7 @@ from services.arguments.common import add_config, add_playing, playing_config
 from services.arguments.sweeping import add_sweep, run_sweep
 from services.arguments.training import add_training_data, training_stores
 from services.figures import time_constants
-from services.figures.drawn import Drawn
+from services.figures.figure_result import FigureResult
 from services.trials.sweeps import Variant
 
 SUMMARY: Final = "train and test networks by their PFC's time constant (paper, figure 5)"
@@ -32,13 +32,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--work",
         type=Path,
-        help="folder of the networks and their trials, where the same command goes on;"
+        help="folder of the networks and their trials; the same command continues with it;"
         " without it, --out without .png",
     )
 
 
-def draw(arguments: argparse.Namespace) -> Drawn:
-    """Train and test what is missing, then draw all."""
+def draw(arguments: argparse.Namespace) -> FigureResult:
+    """Train and test the networks that are not done yet, then draw the success of all."""
     config = playing_config(arguments)
     stores = training_stores(arguments)
     variants = [
@@ -46,12 +46,12 @@ def draw(arguments: argparse.Namespace) -> Drawn:
     ]
     tested = run_sweep(arguments, variants, work_folder(arguments), lambda _: stores)
     tallies = time_constants.tallies_of(tested)
-    return Drawn(
+    return FigureResult(
         time_constants.draw(tallies), time_constants.numbers(tallies), time_constants.table(tallies)
     )
 
 
 def work_folder(arguments: argparse.Namespace) -> Path:
-    """Where the networks and their trials are."""
+    """Return the folder of the networks and their trials."""
     folder: Path = arguments.work or arguments.out.with_suffix("")
     return folder

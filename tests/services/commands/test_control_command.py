@@ -58,7 +58,7 @@ def test_each_process_of_the_role_answers(processes: Processes) -> None:
 def test_a_role_that_nobody_has_is_an_error_that_says_where_to_look(processes: Processes) -> None:
     status, output, errors = processes.control("recorder", "stop")
     assert (status, output) == (1, "")
-    assert "no recorder of run 'controlled' answers" in errors
+    assert "no recorder of run 'controlled' replies" in errors
     assert "vmdnn watch --once" in errors
     assert processes.evaluator.poll() is None
 

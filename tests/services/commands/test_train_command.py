@@ -118,7 +118,7 @@ def test_ctrl_c_saves_and_the_same_command_goes_on_exactly(
     with monkeypatch.context() as patch:
         patch.setattr(Trainer, "epoch", epoch_and_ctrl_c)
         assert train(disturbed) == 130
-    assert "the same command goes on" in capsys.readouterr().out
+    assert "the same command continues" in capsys.readouterr().out
     assert train(disturbed) == 0
     for path in (training_file, lambda run: policy_file(run, 3)):
         assert path(disturbed).read_bytes() == path(undisturbed).read_bytes()

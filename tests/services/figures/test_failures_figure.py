@@ -124,7 +124,7 @@ def test_what_holds_no_trials_is_named(tmp_path: Path, capsys: pytest.CaptureFix
     (tmp_path / "other.jsonl").write_text('{"a": 1}\n')
     for words, message in (
         (f"--outcomes {tmp_path / 'missing'}", "cannot be read"),
-        (f"--outcomes {tmp_path / 'other.jsonl'}", "holds no outcomes"),
+        (f"--outcomes {tmp_path / 'other.jsonl'}", "is not a file of counted trials"),
         (f"--rollouts {tmp_path}", "no trial"),
         ("", "--outcomes"),
     ):

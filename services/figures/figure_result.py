@@ -1,4 +1,4 @@
-"""What a figure's command hands over."""
+"""The result of a figure's command."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from rich.table import Table
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """A figure and what it shows.
+class FigureResult:
+    """A figure with its numbers.
 
     Attributes:
-        figure: to be written.
-        numbers: all that it shows, for `json.dumps`.
-        table: the gist of it, for people.
+        figure: the drawing.
+        numbers: the numbers that it shows, for `json.dumps`.
+        table: a summary of the numbers, for the terminal.
     """
 
     figure: Figure
