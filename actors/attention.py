@@ -1,4 +1,4 @@
-"""What the values of an action mean for the eye and the motors (paper, section 3.2)."""
+"""Converts the values of an action to a crop of the eye image and joint targets (section 3.2)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MAXIMUM: Final = np.array([value.maximum for value in ACTION_VALUES])
 
 
 def crop_of_focus(level: float) -> Crop:
-    """The crop of the eye image that the network sees at a focus level, 1 (wide) to 20 (fovea)."""
+    """Return the crop of the eye image at a focus level from 1 (widest) to 20 (narrowest)."""
     clipped = float(np.clip(level, _MINIMUM[FOCUS], _MAXIMUM[FOCUS]))
     return Crop(round(EYE_WIDTH - 8 * (clipped - 1)), round(EYE_HEIGHT - 6 * (clipped - 1)))
 
@@ -29,14 +29,14 @@ def clip_action(action: Array) -> Array:
 
 
 def with_attention_of(start: Array, action: Array) -> Array:
-    """A copy of `action` (11,) with the neck angles and the focus of `start` (11,)."""
+    """Return a copy of `action` (11,) with the neck angles and the focus of `start` (11,)."""
     fixed = action.copy()
     fixed[NECK], fixed[FOCUS] = start[NECK], start[FOCUS]
     return fixed
 
 
 def targets_of_action(action: Array) -> JointTargets:
-    """Joint targets for an action (11,); the grasp level moves all nine hand motors together."""
+    """Return the joint targets of an action (11,); the grasp level moves all nine hand motors."""
     return JointTargets(
         neck_deg=action[NECK],
         arm_deg=action[ARM],

@@ -1,4 +1,7 @@
-"""Forward kinematics and clearances of the right arm and the gaze, in the world frame."""
+"""Forward kinematics of the right arm, its clearance from boxes, and gaze angles.
+
+All positions are in the world frame.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,7 @@ class ClearanceBox:
     Attributes:
         centre_m: (3,) centre in the world frame.
         size_m: (3,) full edge lengths.
-        yaw_rad: turn about the vertical.
+        yaw_rad: rotation about the vertical.
     """
 
     centre_m: Array
@@ -44,12 +47,15 @@ class ClearanceBox:
     yaw_rad: float = 0.0
 
     def level_axes(self) -> tuple[Array, Array]:
-        """Unit vectors (3,), (3,) along its x and y, in the world frame."""
+        """Return the box's horizontal axes x and y as unit vectors (3,), (3,)."""
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([c, s, 0.0]), np.array([-s, c, 0.0])
 
     def distance(self, points: Array) -> Array:
-        """Signed distances (N,) of points (N, 3) from the surface; negative inside (m)."""
+        """Return the signed distances (N,) of points (N, 3) from the surface (m).
+
+        A distance is negative inside the box.
+        """
         c, s = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         local = (points - self.centre_m) @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         beyond = np.abs(local) - np.asarray(self.size_m) / 2
@@ -59,12 +65,12 @@ class ClearanceBox:
 
 @dataclass(frozen=True)
 class ArmPose:
-    """Where the arm is in one posture.
+    """Pose of the hand and position of the arm's collision points in one posture.
 
     Attributes:
-        rotation: (3, 3) of the hand frame in the world.
-        position_m: (3,) of the hand frame.
-        points_m: (N, 3) points on the axes of the colliders.
+        rotation: (3, 3) rotation of the hand frame.
+        position_m: (3,) origin of the hand frame.
+        points_m: (N, 3) centres of the spheres that approximate the colliders.
     """
 
     rotation: Array
@@ -73,14 +79,23 @@ class ArmPose:
 
 
 class Arm:
-    """The right arm with the hand held at fixed motor angles."""
+    """Kinematic model of the right arm with fixed hand motors.
+
+    Spheres along the axes of the colliders approximate the arm for clearances.
+
+    Attributes:
+        minimum_rad: (7,) lower joint limits.
+        maximum_rad: (7,) upper joint limits.
+        radii_m: (N,) radii of the spheres.
+        of_hand: (N,) whether a sphere belongs to palm and fingers; the others belong to the arm.
+    """
 
     def __init__(self, motors_deg: Array, table_drop_m: float) -> None:
-        """Freeze all joints but the arm's seven.
+        """Build the model, in which only the arm's seven joints move.
 
         Args:
-            motors_deg: (9,) hand motors.
-            table_drop_m: how far the table top (world z = 0) lies below the root link.
+            motors_deg: (9,) angles of the hand motors.
+            table_drop_m: height of the root link above the table top (world z = 0).
         """
         model = build_icub(cache_folder())
         full = pin.buildModelFromUrdf(str(model.urdf))
@@ -102,7 +117,6 @@ class Arm:
         self.of_hand = np.concatenate(
             [np.full(len(cloud[2]), cloud[0] == self._model.njoints - 1) for cloud in self._clouds]
         )
-        """Which points (N,) belong to palm and fingers; the others to the arm."""
 
     def _collider_clouds(self, colliders: tuple[Collider, ...]) -> list[tuple[int, Array, Array]]:
         clouds = []
@@ -114,7 +128,7 @@ class Arm:
         return clouds
 
     def pose(self, posture_rad: Array) -> ArmPose:
-        """Forward kinematics of joint angles (7,) in radians."""
+        """Compute the forward kinematics of joint angles (7,) in radians."""
         pin.forwardKinematics(self._model, self._data, posture_rad)
         hand = pin.updateFramePlacement(self._model, self._data, self._hand)
         points = np.concatenate(
@@ -131,7 +145,10 @@ class Arm:
 
 
 def _sample(collider: Collider, spacing_m: float = 0.015) -> tuple[Array, float]:
-    """Points (N, 3) on the axis of a capsule, or inside a box, and the radius around them."""
+    """Approximate a collider by spheres; return their centres (N, 3) and their radius.
+
+    The centres lie on the axis of a capsule, or on a grid inside a box.
+    """
     if isinstance(collider, Capsule):
         start, end = np.array(collider.start_m), np.array(collider.end_m)
         count = 2 + int(np.linalg.norm(end - start) / spacing_m)
@@ -143,10 +160,14 @@ def _sample(collider: Collider, spacing_m: float = 0.015) -> tuple[Array, float]
 
 
 class Gaze:
-    """The neck, and where the left eye looks."""
+    """Kinematic model of the neck and the left eye."""
 
     def __init__(self, table_drop_m: float) -> None:
-        """Freeze all joints but the neck's two."""
+        """Build the model, in which only the neck's two joints move.
+
+        Args:
+            table_drop_m: height of the root link above the table top (world z = 0).
+        """
         full = pin.buildModelFromUrdf(str(build_icub(cache_folder()).urdf))
         moving = {full.getJointId(name) for name in NECK_JOINTS}
         frozen = [joint for joint in range(1, full.njoints) if joint not in moving]
@@ -157,9 +178,10 @@ class Gaze:
         self._limits = np.deg2rad([JOINT_LIMITS_DEG[name] for name in NECK_JOINTS]).T
 
     def neck_deg(self, point_m: Array) -> Array:
-        """Neck pitch and yaw (2,) in degrees that bring a world point to the middle of the eye.
+        """Return neck pitch and yaw (2,) in degrees that centre a point (3,) in the eye image.
 
-        Out of the neck's reach, the point comes as near to the middle as it can.
+        If the neck cannot reach such angles, the angles bring the point as near to the centre as
+        possible.
         """
 
         def off_axis(neck_rad: Array) -> Array:

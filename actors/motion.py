@@ -1,4 +1,4 @@
-"""Timing of movements, curves through postures, and noise on executed actions."""
+"""Movement profiles, interpolation of postures, and execution noise."""
 
 from __future__ import annotations
 
@@ -14,31 +14,48 @@ from proto.body import ACTION_SIZE, ARM, NECK
 Array = NDArray[np.float64]
 
 
-def minimum_jerk(share: Array | float) -> Array:
-    """Position 0..1 of a minimum-jerk movement at a share 0..1 of its time (Flash & Hogan 1985)."""
-    s = np.clip(share, 0.0, 1.0)
+def minimum_jerk(fraction: Array | float) -> Array:
+    """Return the position 0..1 of a minimum-jerk movement (Flash & Hogan 1985).
+
+    Args:
+        fraction: elapsed fraction 0..1 of the movement's duration; values outside are clipped.
+    """
+    s = np.clip(fraction, 0.0, 1.0)
     return np.asarray(s**3 * (10.0 - 15.0 * s + 6.0 * s * s))
 
 
 def ramp(total: int, start: int, length: int) -> Array:
-    """Minimum-jerk step (total,): 0 before step `start`, 1 from step `start + length - 1` on."""
+    """Return a minimum-jerk ramp (total,) from 0 to 1.
+
+    It is 0 before step `start` and 1 from step `start + length - 1` on.
+    """
     return minimum_jerk((np.arange(total) + 1 - start) / length)
 
 
-def travel(postures: Sequence[Array], share: Array | float) -> Array:
-    """Cubic spline through postures, each (7,), evenly spaced over shares 0..1; (..., 7)."""
+def interpolate_postures(postures: Sequence[Array], fraction: Array | float) -> Array:
+    """Interpolate postures with a cubic spline.
+
+    Args:
+        postures: at least two postures, each (7,), evenly spaced along the path.
+        fraction: (...) fractions 0..1 of the path.
+
+    Returns:
+        (..., 7) the postures at these fractions.
+    """
     spline = CubicSpline(np.linspace(0.0, 1.0, len(postures)), np.stack(postures))
-    return np.asarray(spline(share))
+    return np.asarray(spline(fraction))
 
 
 def execution_noise(steps: int, seed: int, amplitude_deg: float, correlation_steps: float) -> Array:
-    """Smooth noise (T, 11) on neck and arm, close to zero at first; grasp and focus stay at zero.
+    """Return smooth Gaussian noise (T, 11) for actions.
+
+    Neck and arm have noise, which fades in from zero. Grasp and focus have none.
 
     Args:
         steps: number of control steps T.
-        seed: the same seed gives the same noise.
-        amplitude_deg: its standard deviation (degrees).
-        correlation_steps: its correlation time (control steps).
+        seed: seed of the noise.
+        amplitude_deg: standard deviation of the noise (degrees).
+        correlation_steps: correlation time of the noise (control steps).
     """
     random = np.random.default_rng(seed)
     noise = np.zeros((steps, ACTION_SIZE))

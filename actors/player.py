@@ -1,4 +1,4 @@
-"""Plays one episode: observe, decide, move, judge (paper, section 3.2)."""
+"""Plays one episode: observe, choose an action, move, judge (paper, section 3.2)."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LiveStep:
-    """One control step as it happens, for whoever watches.
+    """One control step, for live display.
 
     Attributes:
         step: control step, from 0.
         phase: name of the phase.
         image: (48, 64) uint8, the network's picture.
-        joints_deg: (18,) measured before the action.
-        action: (11,) what the robot is told.
+        joints_deg: (18,) measured before the action (degrees).
+        action: (11,) the commanded action.
     """
 
     step: int
@@ -51,10 +51,25 @@ def play(
     config_digest: str = "",
     on_step: Callable[[LiveStep], None] | None = None,
 ) -> Episode:
-    """Play one episode from the task's start posture and return everything about it.
+    """Play one episode from the task's start posture.
 
-    At step t the robot sees images[t] through the crop of its focus level, is told actions[t], and
-    moves for one control period. An exception from `on_step` ends the episode at once.
+    At step t the policy sees images[t], cropped by the robot's focus level. The robot receives the
+    command actions[t] and moves for one control period.
+
+    Args:
+        simulator: simulator that plays the scene.
+        task: the task.
+        policy: policy that chooses the actions.
+        situation: values of the task's variables by name.
+        seed: seed of all random numbers in the episode.
+        kind: why the episode is played.
+        actor: id of the process that plays it.
+        config_digest: digest of the effective configuration.
+        on_step: called in each control step before the robot moves. An exception that it raises
+            ends the episode at once.
+
+    Raises:
+        UserError: the situation is not valid for the task.
     """
     task.check(situation)
     simulator.reset(task.scene(situation))
@@ -65,7 +80,7 @@ def play(
     focus = float(task.start[FOCUS])
     for step, phase in enumerate(task.phases):
         seen = simulator.observe(crop_of_focus(focus))
-        action = _told(task, clip_action(policy.step(seen.image)))
+        action = _with_task_attention(task, clip_action(policy.step(seen.image)))
         poses.append(simulator.bodies().rows)
         if on_step is not None:
             on_step(LiveStep(step, task.phase_names[phase], seen.image, seen.joints_deg, action))
@@ -73,7 +88,9 @@ def play(
         judge.watch(report, simulator.joints_deg(), simulator.bodies())
         images.append(seen.image)
         actions.append(action)
-        targets.append(action if policy.target is None else _told(task, policy.target))
+        targets.append(
+            action if policy.target is None else _with_task_attention(task, policy.target)
+        )
         joints.append(seen.joints_deg)
         if policy.outputs is not None:
             outputs.append(policy.outputs)
@@ -103,6 +120,6 @@ def play(
     )
 
 
-def _told(task: Task, action: Array) -> Array:
-    """The action as far as the task leaves it to the policy."""
+def _with_task_attention(task: Task, action: Array) -> Array:
+    """Return the action (11,); if the task fixes attention, with neck and focus of the start."""
     return action if task.attention == "active" else with_attention_of(task.start, action)

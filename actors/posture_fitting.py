@@ -1,8 +1,8 @@
-"""Nonlinear least squares for key postures that are polynomials of the situation.
+"""Fits key postures that are polynomials of the situation, by nonlinear least squares.
 
-Inverse kinematics solved situation by situation jumps by tens of degrees between neighbours, and a
-network cannot learn from that. So a key posture is linear in monomials of the situation, and its
-coefficients are fitted to a grid of situations at once.
+Inverse kinematics solved for each situation alone jumps by tens of degrees between neighbouring
+situations; a network cannot learn such jumps. A key posture is therefore linear in monomials of the
+situation, and its coefficients are fitted to a grid of situations together.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Residual = Callable[[Array, int], Array]
 
-# A residual of 1 is one of these: metres, radians.
+# Scales of the residuals (m, rad): a deviation of one scale gives a residual of 1.
 POSITION: Final = 0.001
 LOOSE_POSITION: Final = 0.01
 ANGLE: Final = np.deg2rad(1.0)
@@ -27,15 +27,15 @@ LIMIT: Final = np.deg2rad(0.5)
 def fit_polynomial(
     features: Array, residual: Residual, start: Array, orders: Array, ridge: float = 1.0
 ) -> Array:
-    """Levenberg-Marquardt for postures that are linear in `features`.
+    """Fit postures that are linear in `features`, with the Levenberg-Marquardt method.
 
     Args:
         features: (N, K) monomials of N situations.
-        residual: residuals of a posture (7,) in radians in situation i.
-        start: (K, 7) coefficients to start from.
+        residual: returns the residuals of a posture (7,) in radians in situation i.
+        start: (K, 7) initial coefficients.
         orders: (K,) order of each monomial; the penalty on a coefficient grows with its order.
-        ridge: weight of that penalty; 1 costs little accuracy and halves the difference between
-            the postures of neighbouring situations.
+        ridge: weight of that penalty. A weight of 1 costs little accuracy and halves the difference
+            between the postures of neighbouring situations.
 
     Returns:
         Coefficients (K, 7) in radians.
@@ -68,9 +68,11 @@ def fit_polynomial(
 
 
 def linearize(postures: Array, residual: Residual) -> tuple[list[Array], list[Array], float]:
-    """Residuals (R,) and finite-difference Jacobians (R, 7) at postures (N, 7), and the cost.
+    """Compute residuals and their Jacobians at postures (N, 7), one for each situation.
 
-    The cost is the sum of the squares of all residuals.
+    Returns:
+        N residual vectors (R,), N finite-difference Jacobians (R, 7), and the sum of the squares
+        of all residuals.
     """
     values, jacobians = [], []
     for i, posture in enumerate(postures):
@@ -82,5 +84,8 @@ def linearize(postures: Array, residual: Residual) -> tuple[list[Array], list[Ar
 
 
 def shortfall(distance: Array | float, margin: float) -> Array:
-    """Residuals (N,): how far distances fall short of a margin (m), in units of CLEARANCE."""
+    """Return residuals (N,) of distances that are smaller than a margin (m).
+
+    A residual is the missing distance in units of CLEARANCE; 0 if the distance suffices.
+    """
     return np.asarray(np.maximum(0.0, margin - np.atleast_1d(distance)) / CLEARANCE)

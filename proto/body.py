@@ -1,7 +1,7 @@
 """The eleven analog values that M_O codes (paper, section 4.1), in their fixed order.
 
-An *action* is a float array of shape (11,) in the units below: what the robot is told to do during
-the next control step. Angles are in degrees, levels have no unit.
+An *action* is a float array of shape (11,): the command to the robot for the next control step.
+Angles are in degrees; levels have no unit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ class ActionValue:
     """One analog value of the action.
 
     Attributes:
-        name: what it is called in files, messages and plots.
+        name: its name in files, messages and plots.
         minimum: lowest value the robot accepts (degrees, or a level).
         maximum: highest value the robot accepts (degrees, or a level).
     """

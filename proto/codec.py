@@ -1,16 +1,15 @@
-"""How a dataclass becomes bytes and comes back: msgpack or JSON, every field checked.
+"""Encoding of dataclasses as msgpack or JSON, and decoding with a check of every field.
 
-A message is a frozen dataclass. Each field says how it is checked, beside its type:
+A message is a frozen dataclass. The annotation of each field names its type and its check:
 
     @message("receipt", 1)
     @dataclass(frozen=True)
     class Receipt:
         episode: Annotated[str, Text(64)]
 
-`encode` gives a `Wire` (encoding and payload), `decode` gives the dataclass back, or a
-`MessageError` that names the field; no other exception comes out of a bad payload, whatever its
-bytes. Arrays travel as `[dtype, shape, bytes]`, little-endian, in C order. Nothing is ever
-unpickled.
+`encode` returns a `Wire` (encoding and payload). `decode` returns the dataclass, or raises a
+`MessageError` that names the invalid field; a bad payload raises no other exception. Arrays are
+encoded as `[dtype, shape, bytes]`, little-endian, in C order. Pickle is never used.
 """
 
 from __future__ import annotations
@@ -31,19 +30,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 Plain = Any
-"""What msgpack and JSON know: None, bool, int, float, str, bytes, lists and maps of them."""
+"""A value that msgpack or JSON can hold: None, bool, int, float, str, bytes, lists, maps."""
 
 Sizes = dict[str, int]
-"""Sizes with a name that were met so far in a message, such as its number of steps T."""
+"""Named sizes found so far in a message, such as its number of steps T."""
 
 MEBIBYTE: Final = 1 << 20
 
 
 class MessageError(Exception):
-    """A payload that is not the message it should be.
+    """An invalid message.
 
     Attributes:
-        field: path of the field that is wrong, such as `episode.images`.
+        field: path of the invalid field, such as `episode.images`.
         problem: what is wrong with it.
     """
 
@@ -54,16 +53,21 @@ class MessageError(Exception):
 
 
 class Check(Protocol):
-    """Packs one field into plain values, and checks them when they come back."""
+    """Converts one field to plain values, and back with a check."""
 
     def pack(self, value: Any, /) -> Plain:
-        """Plain form of a value."""
+        """Convert a value to its plain form."""
 
     def unpack(self, plain: Plain, where: str, sizes: Sizes, /) -> Any:
-        """The value of a plain form.
+        """Convert a plain form to the value.
+
+        Args:
+            plain: the plain form.
+            where: path of the field, for the error.
+            sizes: named sizes of the message; the sizes of this field are added.
 
         Raises:
-            MessageError: it is not what this field holds.
+            MessageError: the plain form is not valid for this field.
         """
 
 
@@ -142,7 +146,7 @@ class Text:
 
 @dataclass(frozen=True)
 class NumberOrText:
-    """A finite number, or text; which of the two a value is stays with it."""
+    """A finite number or a text; a number stays a number, a text stays a text."""
 
     number: Number = Number()
     text: Text = Text(64)
@@ -192,24 +196,33 @@ class Blob:
 
 @dataclass(frozen=True)
 class Size:
-    """A size with a name: the same wherever it stands in one message, unless it is its own."""
+    """A named size in least..most, such as the number of steps T.
+
+    All fields of a message that use the name must have the same size, unless it `varies`.
+    """
 
     name: str
     least: int
     most: int
-    own: bool = False
+    varies: bool = False
 
     def check(self, size: int, where: str, sizes: Sizes) -> None:
-        """Take note of a size, or compare it with the one met before."""
+        """Check the range of a size, and that it equals the size of this name in `sizes`.
+
+        The first size of a name is added to `sizes`.
+
+        Raises:
+            MessageError: the size is out of range or differs.
+        """
         if not self.least <= size <= self.most:
             raise MessageError(where, f"{self.name} = {size} is not in {self.least}..{self.most}")
-        if not self.own and sizes.setdefault(self.name, size) != size:
+        if not self.varies and sizes.setdefault(self.name, size) != size:
             raise MessageError(where, f"{self.name} = {size}, but elsewhere {sizes[self.name]}")
 
 
 @dataclass(frozen=True)
 class Array:
-    """An array of one dtype and shape, its elements finite and in least..most."""
+    """An array of a given dtype and shape whose elements are finite and in least..most."""
 
     dtype: str
     shape: tuple[int | Size, ...]
@@ -217,17 +230,17 @@ class Array:
     most: float = math.inf
 
     @cached_property
-    def _own(self) -> np.dtype[Any]:
+    def _native(self) -> np.dtype[Any]:
         return np.dtype(self.dtype)
 
     @cached_property
-    def _wire(self) -> np.dtype[Any]:
-        return self._own.newbyteorder("<")
+    def _little_endian(self) -> np.dtype[Any]:
+        return self._native.newbyteorder("<")
 
     def pack(self, value: NDArray[Any]) -> Plain:
         array = np.asarray(value)
-        # numpy takes longer to name a dtype than to do all the rest
-        name = self.dtype if array.dtype == self._own else array.dtype.name
+        # `dtype.name` is slow: it would take longer than the rest of this function.
+        name = self.dtype if array.dtype == self._native else array.dtype.name
         content = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
         return [name, list(array.shape), content]
 
@@ -240,11 +253,11 @@ class Array:
         self._check_shape(shape, where, sizes)
         if not isinstance(content, bytes):
             raise MessageError(where, f"expected bytes as content, got {_kind(content)}")
-        expected = math.prod(shape) * self._wire.itemsize
+        expected = math.prod(shape) * self._little_endian.itemsize
         if len(content) != expected:
             raise MessageError(where, f"expected {expected} bytes, got {len(content)}")
-        # the copy is writable and in the machine's own byte order
-        array = np.frombuffer(content, self._wire).reshape(shape).astype(self._own)
+        # The copy is writable and in the machine's byte order.
+        array = np.frombuffer(content, self._little_endian).reshape(shape).astype(self._native)
         self._check_range(array, where)
         return array
 
@@ -265,7 +278,7 @@ class Array:
     def _check_range(self, array: NDArray[Any], where: str) -> None:
         if array.size == 0:
             return
-        lowest, highest = float(array.min()), float(array.max())  # NaN if there is one
+        lowest, highest = float(array.min()), float(array.max())  # NaN if an element is NaN
         if not (math.isfinite(lowest) and math.isfinite(highest)):
             raise MessageError(where, "expected finite numbers, got NaN or infinity")
         if not (self.least <= lowest and highest <= self.most):
@@ -276,7 +289,7 @@ class Array:
 
 @dataclass(frozen=True)
 class Maybe:
-    """None, or what `item` says."""
+    """None, or a value that `item` allows."""
 
     item: Check
 
@@ -289,7 +302,10 @@ class Maybe:
 
 @dataclass(frozen=True)
 class Added(Maybe):
-    """A `Maybe` that a message got later: None is not sent, so older programs understand it."""
+    """A `Maybe` for a field that was added later to a message.
+
+    None is not sent, so that older programs can decode the message.
+    """
 
 
 @dataclass(frozen=True)
@@ -337,9 +353,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Record:
-    """A dataclass, field by field; none may be unknown, none but those `Added` may be missing."""
+    """A dataclass, as a map of its fields.
 
-    made: type[Any]
+    Unknown fields are refused. Missing fields are refused, except those that are `Added`.
+    """
+
+    record_class: type[Any]
     fields: Mapping[str, Check]
 
     def pack(self, value: Any) -> Plain:
@@ -361,21 +380,21 @@ class Record:
                 raise MessageError(_path(where, name), "is missing")
             values[name] = check.unpack(plain.get(name), _path(where, name), sizes)
         try:
-            return self.made(**values)
-        except ValueError as error:  # fields that are valid one by one, but not together
+            return self.record_class(**values)
+        except ValueError as error:  # each field is valid, but not their combination
             raise MessageError(where or "payload", str(error)) from error
 
 
 @dataclass(frozen=True)
 class Schema:
-    """What goes over the wire under one name.
+    """The encoding of one message class.
 
     Attributes:
         name: name of the message.
-        version: raised with every change that an older program would not understand.
-        form: how it is written; JSON where people and other programs read along.
-        limit: most bytes of a payload.
-        record: its fields.
+        version: increased with every change that an older program cannot decode.
+        form: format of the payload; JSON if people or other programs read the message.
+        limit: largest size of a payload (bytes).
+        record: the checks of its fields.
     """
 
     name: str
@@ -396,7 +415,7 @@ class Wire:
 
     Attributes:
         encoding: Zenoh encoding, see `Schema.encoding`.
-        payload: its bytes.
+        payload: the encoded bytes.
     """
 
     encoding: str
@@ -414,18 +433,21 @@ def message(
     form: Literal["msgpack", "json"] = "msgpack",
     limit: int = 64 * 1024,
 ) -> Callable[[type[Message]], type[Message]]:
-    """Declare a frozen dataclass to be a message; see the top of this module."""
+    """Return a decorator that registers a frozen dataclass as a message.
 
-    def declare(made: type[Message]) -> type[Message]:
-        _SCHEMAS[made] = Schema(name, version, form, limit, record_of(made))
-        return made
+    The docstring of this module shows an example; `Schema` documents the arguments.
+    """
 
-    return declare
+    def register(message_class: type[Message]) -> type[Message]:
+        _SCHEMAS[message_class] = Schema(name, version, form, limit, record_of(message_class))
+        return message_class
+
+    return register
 
 
-def schema_of(made: type[Any]) -> Schema:
-    """The schema of a message's class."""
-    return _SCHEMAS[made]
+def schema_of(message_class: type[Any]) -> Schema:
+    """Return the schema of a message class."""
+    return _SCHEMAS[message_class]
 
 
 def encode(value: Any, *, check: bool = True) -> Wire:
@@ -433,11 +455,11 @@ def encode(value: Any, *, check: bool = True) -> Wire:
 
     Args:
         value: the message.
-        check: see whether its fields hold what they may; without it, only receivers do.
+        check: check the fields here too; otherwise only receivers check them.
 
     Raises:
-        MessageError: a field holds what its check does not allow: better said here, to the one
-            who made it, than by every receiver.
+        MessageError: a field is not valid. The sender learns of it here, before every receiver
+            would drop the message.
     """
     schema = _SCHEMAS[type(value)]
     plain = schema.record.pack(value)
@@ -452,12 +474,12 @@ def encode(value: Any, *, check: bool = True) -> Wire:
 
 
 def decode(wire: Wire, *classes: type[Message]) -> Message:
-    """Decode a message of one of `classes`; its encoding tells which.
+    """Decode a message of one of `classes`; the encoding selects the class.
 
     Raises:
-        MessageError: it is another message, another version, or a field is not as it should be.
+        MessageError: it is a message of another class or version, or a field is not valid.
     """
-    schemas = [_SCHEMAS[made] for made in classes]
+    schemas = [_SCHEMAS[message_class] for message_class in classes]
     schema = next((schema for schema in schemas if schema.encoding == wire.encoding), None)
     if schema is None:
         expected = " or ".join(schema.encoding for schema in schemas)
@@ -491,23 +513,23 @@ def _read_json(payload: bytes) -> Plain:
         raise MessageError("payload", f"is not JSON: {str(error)[:128]}") from error
 
 
-def record_of(made: type[Any]) -> Record:
-    """The checks of a dataclass's fields, from their annotations.
+def record_of(record_class: type[Any]) -> Record:
+    """Make the checks of a dataclass's fields from their annotations.
 
     Raises:
-        TypeError: a field's annotation does not say how to check it.
+        TypeError: a field's annotation contains no check.
     """
-    hints = typing.get_type_hints(made, include_extras=True)
+    hints = typing.get_type_hints(record_class, include_extras=True)
     return Record(
-        made,
+        record_class,
         {
-            field.name: _check_of(hints[field.name], f"{made.__name__}.{field.name}")
-            for field in dataclasses.fields(made)
+            field.name: _check_of(hints[field.name], f"{record_class.__name__}.{field.name}")
+            for field in dataclasses.fields(record_class)
         },
     )
 
 
-_OF_PLAIN_TYPES: Final[Mapping[Any, Check]] = {
+_CHECKS_OF_PLAIN_TYPES: Final[Mapping[Any, Check]] = {
     bool: Flag(),
     int: Integer(),
     float: Number(),
@@ -519,8 +541,8 @@ def _check_of(hint: Any, where: str) -> Check:
     if get_origin(hint) is Annotated:
         check: Check = get_args(hint)[1]
         return check
-    if hint in _OF_PLAIN_TYPES:
-        return _OF_PLAIN_TYPES[hint]
+    if hint in _CHECKS_OF_PLAIN_TYPES:
+        return _CHECKS_OF_PLAIN_TYPES[hint]
     if isinstance(hint, type) and issubclass(hint, Enum):
         return Choice(hint)
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):

@@ -1,4 +1,4 @@
-"""The configuration of a run: YAML, checked field by field, unknown keys refused."""
+"""The configuration of a run, read from YAML. Every value is checked; unknown keys are refused."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from proto.seeds import SEEDS_PER_CASE, TRIALS_BELOW
 from proto.storage import written_whole
 from proto.strict_yaml import WrittenFloat, WrittenInt, dump_yaml, load_yaml
 
-# Strict: a text or a truth value is never taken for a number.
+# Strict: a text or a truth value is not accepted as a number.
 Switch = Annotated[bool, Field(strict=True)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
@@ -38,7 +38,8 @@ AtLeastTwo = Annotated[int, Field(strict=True, ge=2)]
 def _check_repeats(repeats: int) -> int:
     if repeats > SEEDS_PER_CASE:
         raise ValueError(
-            f"must not exceed {SEEDS_PER_CASE}: a case has so many seeds, one for each repeat"
+            f"must not exceed {SEEDS_PER_CASE}: each repeat needs one of the"
+            f" {SEEDS_PER_CASE} seeds of its case"
         )
     return repeats
 
@@ -54,14 +55,14 @@ def _expand_home(folder: Path) -> Path:
 
 
 class _Section(BaseModel):
-    """A part of the configuration; in YAML an empty section means all defaults."""
+    """A section of the configuration; an empty section in YAML means all defaults."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     @model_validator(mode="before")
     @classmethod
-    def _as_written(cls, values: Any) -> Any:
-        """Accept an empty section, and numbers as texts, such as `name: 007`, as they stand."""
+    def _keep_texts_as_written(cls, values: Any) -> Any:
+        """Accept an empty section; keep a number for a text field, `name: 007`, as written."""
         if values is None:
             return {}
         if not isinstance(values, dict):
@@ -78,7 +79,7 @@ class _Section(BaseModel):
 
 
 class RunConfig(_Section):
-    """Name and folder of the run, and the seed of everything random in its training."""
+    """Name and folder of the run, and the seed of all random numbers in its training."""
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = "experiment1"
     folder: Annotated[Path, AfterValidator(_expand_home)] = Path("runs")
@@ -95,21 +96,22 @@ class HubConfig(_Section):
 
 
 TaskName = Annotated[str, Field(min_length=1, max_length=200)]
-"""A built-in task, or one of the user's own as `package.module:Class`."""
+"""Name of a built-in task, or a user's task class as `package.module:Class`."""
 
 
 Attention = Literal["active", "fixed"]
-"""Whether the robot moves its head and its focus, or keeps both as they are at the start."""
+"""active: the policy controls neck and focus; fixed: both stay as at the start."""
 
 
 class TaskConfig(_Section):
-    """Which task is tutored and tested, and whether gaze and focus have a part in it.
+    """The task that is tutored and tested.
 
     Attributes:
-        name: a task of `actors.tasks.registry`, or one's own as `package.module:Class`.
-        attention: whether the robot turns its head and focuses.
+        name: a task of `actors.tasks.registry`, or a user's class as `package.module:Class`.
+        attention: whether the policy controls neck and focus (`active`) or both stay as at the
+            start (`fixed`).
 
-    A task may have options of its own; it checks them itself, see `options`.
+    Other keys are options of the task, which checks them itself; see `options`.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -119,12 +121,19 @@ class TaskConfig(_Section):
 
     @property
     def options(self) -> dict[str, Any]:
-        """What the section holds besides the keys above."""
+        """The task's options: all keys of the section except name and attention."""
         return dict(self.model_extra or {})
 
 
 class SimulatorConfig(_Section):
-    """Which simulator plays the scenes, and with which time steps."""
+    """The simulator and its time steps.
+
+    Attributes:
+        backend: name of the simulator.
+        control_period_s: time of a control step.
+        physics_period_s: time of a physics step; a control step is a whole number of them.
+        render: render the eye image; without it the policy sees no picture.
+    """
 
     backend: str = "sapien"
     control_period_s: Positive = 0.1
@@ -147,8 +156,8 @@ class ActorConfig(_Section):
     """What actors do besides tutoring and trials.
 
     Attributes:
-        practice: play random situations when nothing is asked for.
-        live: publish each control step while anyone subscribes to it.
+        practice: play random situations when learner and evaluator request nothing.
+        live: publish each control step while there is a subscriber.
     """
 
     practice: Switch = True
@@ -156,14 +165,14 @@ class ActorConfig(_Section):
 
 
 class TutorConfig(_Section):
-    """How the tutor executes its plan when a case is tutored again, and how it guides a policy.
+    """How the tutor repeats a case with noise, and how it guides a policy.
 
     Attributes:
         repeats: executions of each case; the first has no noise.
-        noise_deg: amplitude of the execution noise.
-        noise_correlation_steps: over how many control steps it is correlated.
-        guidance_deg: in a correction, how far the actions of neck and arm may be from the clean
-            plan.
+        noise_deg: standard deviation of the execution noise (degrees).
+        noise_correlation_steps: correlation time of the execution noise (control steps).
+        guidance_deg: largest difference between the actions of neck and arm and the tutor's plan
+            in a correction (degrees).
     """
 
     repeats: Repeats = 4
@@ -173,14 +182,21 @@ class TutorConfig(_Section):
 
 
 class SubnetConfig(_Section):
-    """A subnet of leaky integrators without space (PFC, M_S, M_F)."""
+    """A fully connected subnet of leaky integrators (PFC, M_S, M_F)."""
 
     units: Count
     tau: TimeConstant
 
 
 class MapsConfig(_Section):
-    """A convolutional subnet (V_F, V_S): maps, kernel of its input (width, height), stride."""
+    """A convolutional subnet (V_F, V_S).
+
+    Attributes:
+        maps: number of feature maps.
+        kernel: width and height of the kernel over its input.
+        stride: step of the kernel in both directions.
+        tau: time constant (control steps).
+    """
 
     maps: Count
     kernel: tuple[Count, Count]
@@ -204,7 +220,7 @@ class NetworkConfig(_Section):
     @model_validator(mode="before")
     @classmethod
     def _complete_subnets(cls, values: Any) -> Any:
-        """Take what is not given of a subnet from the paper: `pfc: {tau: 30}` gives no units."""
+        """Complete a subnet that is given in part, such as `pfc: {tau: 30}`, with its defaults."""
         if not isinstance(values, dict):
             return values
         given = {n: value or {} for n, value in values.items() if isinstance(value, dict | None)}
@@ -219,11 +235,11 @@ class NetworkConfig(_Section):
 class PretrainingConfig(_Section):
     """Pre-training of the MSTNN as a delayed-response classifier (section 3.3).
 
-    On the bus the learner first asks the actors for the sequences of pre-training: each of `cases`
-    (indices of the tutored cases of `task`, None for all) `repeats` times. It starts with
-    `start_sequences` of them, or with all if they are fewer. Without a task of its own, and in
-    `vmdnn train` without --pretraining-data, the sequences of coupled training serve. What is asked
-    about them is the task's to say.
+    If `task` is set, the learner on the bus first requests sequences of that task from the actors:
+    each of `cases` (indices of its tutored cases, None for all) `repeats` times. Pre-training
+    starts with `start_sequences` of them, or with all if there are fewer. If `task` is None, and in
+    `vmdnn train` without --pretraining-data, pre-training uses the sequences of coupled training.
+    The task defines the questions that the network learns to answer.
     """
 
     task: TaskName | None = None
@@ -233,27 +249,29 @@ class PretrainingConfig(_Section):
     epochs: Natural = 30
     rate: Positive = 2e-3
     batch: Count = 15
-    # disturbance of the pictures, another one for each sequence and epoch: largest shift in pixels,
-    # standard deviations of contrast and brightness, and of each pixel (brightness is -1..1)
+    # Augmentation of the pictures, drawn anew for each sequence and epoch: largest shift (pixels),
+    # standard deviation of contrast and brightness, standard deviation of pixel noise. Pixel values
+    # are -1..1.
     image_shift: Natural = 3
     image_gain: NotNegative = 0.05
     image_noise: NotNegative = 0.03
 
 
 class CorrectionsConfig(_Section):
-    """Tutoring that goes on when coupled training is over, on the bus only.
+    """Rounds of corrections after coupled training; on the bus only.
 
     In each round the tutor guides the newest policy in some situations (see
-    `TutorConfig.guidance_deg`). Then training goes on with all sequences for some epochs, which
-    have a warm-up and a schedule of their own and end with a policy.
+    `TutorConfig.guidance_deg`). Then training continues with all sequences for `epochs`, with a new
+    warm-up and learning-rate schedule, and publishes a policy.
 
     Attributes:
         rounds: number of rounds.
-        choose: the situations: those in which the newest policy was not precise in practice
-            (`failures`), random ones, or the tutored cases in their order.
-        sequences: corrections of a round; fewer if there are fewer tutored cases.
+        choose: how situations are chosen. `failures`: situations of practice in which the newest
+            policy was not precise; `random`: random situations; `tutored`: the tutored cases in
+            their order.
+        sequences: corrections in a round; fewer if `tutored` is chosen and there are fewer cases.
         tries: episodes of practice that are judged in a round to find failures.
-        epochs: epochs after each round.
+        epochs: epochs of training in a round.
     """
 
     rounds: Natural = 0
@@ -266,11 +284,11 @@ class CorrectionsConfig(_Section):
 class LearnerConfig(_Section):
     """Coupled training of PFC, M_S and M_F, and when policies are published.
 
-    On the bus the learner asks the actors for its sequences: each of `cases` (indices of the task's
-    tutored cases, None for all) `tutor.repeats` times; a case handed out for `lease_s` is handed
-    out again. Training starts with `start_sequences` of them, or with all if they are fewer. It
-    publishes a policy every `publish_every_epochs` and after the last of its `epochs`. Then come
-    the rounds of `corrections`, each with a policy at its end.
+    On the bus the learner requests sequences from the actors: each of `cases` (indices of the
+    task's tutored cases, None for all) `tutor.repeats` times. If the sequence of a case does not
+    arrive within `lease_s`, the case is assigned again. Training starts with `start_sequences`, or
+    with all sequences if there are fewer. It publishes a policy every `publish_every_epochs` and
+    after the last of its `epochs`. The rounds of `corrections` follow.
     """
 
     cases: tuple[Natural, ...] | None = None
@@ -282,11 +300,11 @@ class LearnerConfig(_Section):
     warmup_epochs: Natural = 12
     batch: Count = 30
     clip_norm: Positive | None = 1.0
-    # in coupled training: disturbance of each unit of V_S, another one for each sequence and epoch,
-    # in standard deviations of the unit's activity
+    # Noise added to each unit of V_S in coupled training, drawn anew for each sequence and epoch,
+    # in standard deviations of the unit's activity.
     vision_noise: NotNegative = 0.3
-    # share of the sequences in whose place one between tutored situations is learned, guessed from
-    # the sequences around it
+    # Fraction of the sequences that coupled training replaces by sequences interpolated between
+    # neighbouring tutored situations.
     interpolation: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.7
     initial_range: Positive = 0.1
     initial_range_pfc_input: Positive = 0.2
@@ -298,22 +316,23 @@ class LearnerConfig(_Section):
 
 
 RivalKind = Literal["cnn-lstm", "feed-forward"]
-"""Networks of other kinds that VMDNN is compared with."""
+"""Kinds of networks that VMDNN is compared with."""
 
 
 class RivalConfig(_Section):
-    """A network of another kind, which learns in two stages as VMDNN does.
+    """A network that VMDNN is compared with. Like VMDNN it is trained in two stages.
 
-    First all of it learns from pictures to outputs. Then its vision stays as it is, and the rest
-    learns on, from mixtures of neighbouring situations. Schedule, warm-up, minibatches, clipping
-    and, in the second stage, disturbance of what is seen are those of coupled training.
+    In the first stage all weights are trained. In the second stage the weights of the vision are
+    fixed, and the others are trained further, also with sequences interpolated between neighbouring
+    situations. Schedule, warm-up, minibatches, clipping and the noise added to the vision's output
+    in the second stage are those of coupled training.
 
     Attributes:
-        units: of its LSTM, or of its hidden layer.
+        units: number of units of its LSTM or of its hidden layer.
         together_epochs: epochs of the first stage.
         epochs: epochs of the second stage.
-        rate: learning rate of Adam in either.
-        image_shift, image_gain, image_noise: disturbance of its pictures in the first stage, as in
+        rate: learning rate of Adam in both stages.
+        image_shift, image_gain, image_noise: augmentation of the pictures in the first stage, as in
             pre-training.
     """
 
@@ -333,40 +352,50 @@ class CnnLstmConfig(RivalConfig):
 
 
 class FeedForwardConfig(RivalConfig):
-    """A small CNN with a hidden layer, which acts from the current picture alone."""
+    """A small CNN with a hidden layer, which uses the current picture only."""
 
     units: Count = 128
 
 
 class ComparisonConfig(_Section):
-    """The networks that `vmdnn compare` trains beside VMDNN; about as many weights by default."""
+    """The networks that `vmdnn compare` trains; by default about as many weights as VMDNN."""
 
     cnn_lstm: CnnLstmConfig = CnnLstmConfig()
     feed_forward: FeedForwardConfig = FeedForwardConfig()
 
 
 class EvaluatorConfig(_Section):
-    """Trials of unlearned situations, counted for each policy version."""
+    """Trials of each policy version in situations that were not tutored.
+
+    Attributes:
+        trials_per_policy: number of trials of each policy version.
+        seed: seed of the first trial; trial i has the seed `seed + i`.
+        lease_s: a trial that is not finished after this time is assigned again (s).
+    """
 
     trials_per_policy: Annotated[int, Field(strict=True, ge=1, le=2**28)] = 52
-    # so that the seeds of all trials are below those of corrections and practice
+    # The bound keeps the seeds of all trials below those of corrections and practice.
     seed: Annotated[int, Field(strict=True, ge=0, le=TRIALS_BELOW - 2**28)] = 1000
     lease_s: Positive = 60.0
 
 
 class RecorderConfig(_Section):
-    """Which rollouts are recorded: all of them, or only trials."""
+    """Which rollouts are recorded.
+
+    Attributes:
+        practice: record episodes of practice too, not only trials.
+    """
 
     practice: Switch = True
 
 
 class DoneConfig(_Section):
-    """When a run started by deploy/run_local.sh is finished; without conditions it never is.
+    """When a run started by deploy/run_local.sh is finished; without conditions it does not end.
 
     Attributes:
         policy_versions: number of policy versions to publish.
-        trials: number of trials to count of the newest policy version, which must be at least
-            `policy_versions`.
+        trials: number of trials of the newest policy version to count. With `policy_versions`,
+            the newest version must be that one or a later one.
     """
 
     policy_versions: Count | None = None
@@ -374,7 +403,7 @@ class DoneConfig(_Section):
 
     @property
     def ever(self) -> bool:
-        """Whether there is a condition."""
+        """Whether there is a condition, so that the run can be done."""
         return self.policy_versions is not None or self.trials is not None
 
 
@@ -401,12 +430,12 @@ class Config(_Section):
 
     @property
     def pretraining_task(self) -> str | None:
-        """Task of the sequences of pre-training; None if it uses those of coupled training."""
+        """Task of the pre-training sequences; None if those of coupled training are used."""
         first = self.learner.pretraining
         return None if first.epochs == 0 or first.task == self.task.name else first.task
 
     def task_called(self, name: str) -> TaskConfig:
-        """The section `task` for another task, of which it knows no options."""
+        """Return the section `task` for a task; another task has no options, the same attention."""
         if name == self.task.name:
             return self.task
         return TaskConfig(name=name, attention=self.task.attention)
@@ -425,7 +454,7 @@ class Config(_Section):
         return self
 
     def digest(self) -> str:
-        """Twelve hexadecimal digits over all values, except the hub's and the run's folder."""
+        """Hash all values except the section `hub` and `run.folder`; twelve hexadecimal digits."""
         values = self.model_dump(mode="json", exclude={"hub": True, "run": {"folder"}})
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -434,7 +463,7 @@ class Config(_Section):
         """Write the effective configuration as YAML.
 
         Raises:
-            UserError: it cannot be written there.
+            UserError: the file cannot be written.
         """
         with written_whole(path) as stream:
             stream.write(dump_yaml(self.model_dump(mode="json")).encode())

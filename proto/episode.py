@@ -1,4 +1,4 @@
-"""One episode: what was seen, told, done, and how it ended. The unit of tutoring and evaluation."""
+"""One episode: pictures, actions, joints, bodies and outcome. The unit of tutoring and trials."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ States = Mapping[str, Floats]
 
 JOINTS: Final = len(JOINT_NAMES)
 LARGEST_DEG: Final = 360.0
-"""No joint angle or level is larger."""
+"""Largest magnitude of a joint angle or a level in an episode."""
 STEPS: Final = Size("T", 1, 2000)
 BODIES: Final = Size("B", 0, 256)
 PHASES: Final = Size("phases", 1, 255)
 Id = Annotated[str, Text(64, r"[A-Za-z0-9][A-Za-z0-9._-]*")]
-"""Names an episode, a process or a run; may stand in a key and in a file name."""
+"""Id of an episode, a process or a run. It is valid as part of a key and of a file name."""
 
 
 class Kind(StrEnum):
     """Why an episode was played.
 
-    tutoring: the tutor showed a case.
-    correction: a policy acted while the tutor guided it; learned from as tutoring is.
-    trial: the evaluator asked for it.
-    practice: an actor chose a situation itself.
+    tutoring: the tutor demonstrated a case.
+    correction: a policy acted while the tutor guided it; the learner learns from it too.
+    trial: the evaluator requested it.
+    practice: an actor drew a random situation.
     """
 
     TUTORING = "tutoring"
@@ -55,17 +55,17 @@ class Kind(StrEnum):
 
 
 NO_FAILURE: Final = "none"
-"""The reason of an outcome that is precise."""
+"""The `reason` of a precise outcome."""
 ReasonField = Annotated[str, Text(64, r"[a-z][a-z0-9_]*")]
 
 
 @dataclass(frozen=True)
 class Measure:
-    """A number that was measured in an episode.
+    """A number that the judge measured in an episode.
 
     Attributes:
         value: the number.
-        unit: its unit, such as `mm`, `deg` or `step`; empty if it has none.
+        unit: unit of the value, such as `mm`, `deg` or `step`; empty if it has none.
     """
 
     value: Annotated[float, Number()]
@@ -74,15 +74,15 @@ class Measure:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an episode ended, in the three readings of success. The task says what each asks for.
+    """How an episode ended, in three readings of success. The task defines the three criteria.
 
     Attributes:
-        lenient: the paper's reading.
-        strict: a reading that a robot without eyes seldom passes.
-        precise: strict, and the hand was placed right.
-        reason: why it was not precise, a word of the task such as `not_lifted`; NO_FAILURE if it
-            was.
-        measures: what the task measured, by name.
+        lenient: success by the paper's criterion.
+        strict: success by a criterion that a policy without vision seldom meets.
+        precise: strict success with a precisely placed hand.
+        reason: why the episode was not precise, in a word of the task such as `not_lifted`;
+            NO_FAILURE if it was precise.
+        measures: the task's measures by name.
     """
 
     lenient: bool
@@ -92,52 +92,56 @@ class Outcome:
     measures: Annotated[Mapping[str, Measure], Table(record_of(Measure), most=64)]
 
     def __post_init__(self) -> None:
-        """Raise ValueError unless precise implies strict, strict lenient, and the reason fits."""
+        """Check that precise implies strict, strict implies lenient, and the reason fits.
+
+        Raises:
+            ValueError: they contradict each other.
+        """
         if self.precise > self.strict or self.strict > self.lenient:
             raise ValueError("an outcome that is precise is strict, and one that is strict lenient")
         if self.precise != (self.reason == NO_FAILURE):
             raise ValueError(f"reason {self.reason!r} does not fit precise = {self.precise}")
 
     def value(self, measure: str) -> float:
-        """The value of a measure; KeyError if the task does not measure it."""
+        """Return the value of a measure; KeyError if the task has no such measure."""
         return self.measures[measure].value
 
 
 SIMULATION_FAILED: Final = Outcome(False, False, False, "simulation_failed", {})
-"""Outcome of a trial whose simulation gave no valid episode; nothing was measured."""
+"""Outcome of a trial whose simulation failed; it has no measures."""
 
 
 @dataclass(frozen=True)
 class Episode:
     """One episode of T control steps.
 
-    At step t the robot sees images[t], is told actions[t], and moves for one control period.
+    At step t the robot sees images[t], receives the command actions[t], and moves for one control
+    period.
 
     Attributes:
         id: random hexadecimal id, unique.
         kind: why it was played.
         task: name of the task.
         situation: the values of the task's variables by name, in the paper's task frame.
-        seed: seed of everything random in it.
+        seed: seed of all random numbers in the episode.
         actor: id of the process that played it.
         backend: name of the simulator.
         policy: name of the policy.
-        policy_version: version of the policy, 0 for one never trained.
+        policy_version: version of the policy; 0 if it was not trained.
         config_digest: digest of the effective configuration.
         images: (T, 48, 64) uint8, the network's grey picture before normalization.
-        actions: (T, 11) float32, what the robot was told (units of `proto.body`).
-        targets: (T, 11) float32, what was meant: the clean plan where the tutor executed it with
-            noise or guided a policy, else equal to the actions.
+        actions: (T, 11) float32, the commanded actions (units of `proto.body`).
+        targets: (T, 11) float32, the actions to learn: the tutor's plan without noise if the tutor
+            executed it with noise or guided a policy; otherwise equal to `actions`.
         joints_deg: (T, 18) float32, measured before the action: neck, arm, hand motors.
         phase_names: names of the task's phases in their order.
         phases: (T,) uint8, index into phase_names of each step.
-        body_names: names of the bodies, B of them.
+        body_names: names of the B bodies.
         body_poses: (T, B, 7) float32, position (m) and quaternion (w first) in the world frame.
         outcome: how it ended.
-        outputs: (T, 110) float32, softmax outputs of the network, or None.
+        outputs: (T, 110) float32, softmax outputs of the network; None for other policies.
         control_period_s: time from one control step to the next (s).
-        states: (T, units) float32 of each subnet by name, its activity, where that was asked for;
-            else None.
+        states: activity (T, units) float32 of each subnet by name; None if it was not recorded.
         training: id of the training that the policy comes from; empty for the tutor and for a
             policy from a file.
     """
@@ -167,12 +171,12 @@ class Episode:
     control_period_s: Annotated[float, Number(1e-6, 1e3)] = 0.1
     states: Annotated[
         States | None,
-        Added(Table(Array("float32", (STEPS, Size("units", 1, 65536, own=True))), most=16)),
+        Added(Table(Array("float32", (STEPS, Size("units", 1, 65536, varies=True))), most=16)),
     ] = field(default=None)
     training: Annotated[str, Text(64)] = ""
 
     def __post_init__(self) -> None:
-        """Raise ValueError if a step is in a phase without a name."""
+        """Raise ValueError if a step's phase has no name."""
         if len(self.phases) and int(self.phases.max()) >= len(self.phase_names):
             raise ValueError(
                 f"phases: a step is in phase {self.phases.max()} of {len(self.phase_names)}"

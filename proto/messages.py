@@ -1,4 +1,4 @@
-"""Messages between the processes. Every field is checked as its annotation says."""
+"""Messages between the processes. The annotation of a field defines its check."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ Count = Annotated[int, Integer(0, 2**31)]
 Seed = Annotated[int, Integer(0, 2**63 - 1)]
 
 PolicyKey = tuple[str, int]
-"""What identifies a policy: id of its training, and its version."""
+"""Identifies a policy: id of its training, and its version."""
 
 
 @message("policy", 1, limit=POLICY_LIMIT + MEBIBYTE)
 @dataclass(frozen=True)
 class PolicyVersion:
-    """A trained network, for everyone who acts or tests.
+    """A trained network, from the learner to actors and evaluator.
 
     Attributes:
-        run_id: id of the training; a new one begins when a run is started from nothing.
-        version: 1, 2, ... within a training; it never goes back.
+        run_id: id of the training; a training that starts without a checkpoint has a new id.
+        version: 1, 2, ... within a training; it only increases.
         epoch: epoch of the coupled training after which it was published.
         loss: training loss at that epoch.
         config_digest: digest of the learner's configuration.
@@ -48,7 +48,7 @@ class PolicyVersion:
 @message("sequence", 3, limit=EPISODE_LIMIT)
 @dataclass(frozen=True)
 class Sequence:
-    """A tutored episode or a correction, for the learner."""
+    """A tutored episode or a correction, from an actor to the learner."""
 
     episode: Episode
 
@@ -56,11 +56,11 @@ class Sequence:
 @message("rollout", 2, limit=EPISODE_LIMIT)
 @dataclass(frozen=True)
 class Rollout:
-    """An episode that a network played, as a trial or for practice, for the evaluator.
+    """An episode that a network played as a trial or in practice, from an actor to the evaluator.
 
     Attributes:
         episode: the episode.
-        run_id: training that the policy comes from.
+        run_id: id of the training that the policy comes from.
     """
 
     episode: Episode
@@ -70,21 +70,21 @@ class Rollout:
 @message("episode_failed", 1)
 @dataclass(frozen=True)
 class EpisodeFailed:
-    """An episode that was asked for but whose simulation failed, so that there is no outcome.
+    """Report that the simulation of a requested episode failed, so that it has no outcome.
 
-    The evaluator counts a trial as a failure. The learner gives up a tutored case or a correction
-    that fails again and again.
+    The evaluator counts the trial as a failure. The learner gives up a tutored case or a correction
+    that fails repeatedly.
 
     Attributes:
         id: id of the episode.
         actor: id of the actor that played it.
-        kind: why it was played; actors report no failure of practice.
+        kind: why it was played. Failures of practice are not reported.
         task: name of the task.
         seed: seed of the episode.
         situation: the situation's values by name.
         training: id of the training that the policy comes from, empty for the tutor.
         policy_version: version of the policy, 0 for the tutor.
-        problem: what is wrong with the episode.
+        problem: why the simulation failed.
     """
 
     id: Id
@@ -101,11 +101,12 @@ class EpisodeFailed:
 @message("receipt", 2)
 @dataclass(frozen=True)
 class Receipt:
-    """The answer to an episode, or to the report that it failed: it need not be sent again.
+    """Reply to an episode or to an `EpisodeFailed`: the sender need not send it again.
 
     Attributes:
         episode: id of the episode.
-        refusal: why the receiver will never take it; empty if it is kept, or if an equal one is.
+        refusal: why the receiver refuses the episode for good; empty if it has stored this episode
+            or an equal one.
     """
 
     episode: Id
@@ -115,7 +116,7 @@ class Receipt:
 @message("tutoring_request", 2)
 @dataclass(frozen=True)
 class TutoringRequest:
-    """An actor asks for a tutored case to demonstrate, or for a situation to be guided in.
+    """An actor's request for a `TutoringCase` or a `Correction`.
 
     Attributes:
         actor: id of the actor.
@@ -134,9 +135,9 @@ class TutoringCase:
     """A tutored case to demonstrate.
 
     Attributes:
-        task: name of the task; pre-training may have a task of its own.
+        task: name of the task; pre-training can use another task than coupled training.
         case: index into the task's tutored situations.
-        repeat: 0 for the clean plan, 1, 2, ... for executions with noise.
+        repeat: 0 for the plan without noise; 1, 2, ... for executions with noise.
     """
 
     task: Annotated[str, Text(64)]
@@ -152,7 +153,7 @@ class TutoringCase:
 @message("correction", 2)
 @dataclass(frozen=True)
 class Correction:
-    """A situation in which the actor's policy acts while the tutor guides it.
+    """A situation in which the actor's policy shall act while the tutor guides it.
 
     Attributes:
         task: name of the task.
@@ -168,10 +169,10 @@ class Correction:
 @message("verdict", 2)
 @dataclass(frozen=True)
 class Verdict:
-    """How an episode of practice ended; the learner tutors where the policy failed.
+    """Outcome of an episode of practice. The learner chooses corrections where the policy failed.
 
     Attributes:
-        run_id: training that the policy comes from.
+        run_id: id of the training that the policy comes from.
         policy_version: its version.
         task: name of the task.
         seed: seed of the episode.
@@ -190,7 +191,7 @@ class Verdict:
 @message("trial_request", 1)
 @dataclass(frozen=True)
 class TrialRequest:
-    """An actor asks for a trial of the policy that it holds; fields as in `TutoringRequest`."""
+    """An actor's request for a trial of its policy; fields as in `TutoringRequest`."""
 
     actor: Id
     run_id: Id
@@ -223,7 +224,7 @@ class Live:
         phase: name of the phase.
         image: (48, 64) uint8, the network's grey picture.
         joints_deg: (18,) float32, neck, arm and hand as measured.
-        action: (11,) float32, the action that the robot executes.
+        action: (11,) float32, the commanded action.
     """
 
     actor: Id
@@ -238,9 +239,9 @@ class Live:
 
 
 class Command(StrEnum):
-    """What a process can be asked to do.
+    """A command to a process.
 
-    pause: stop playing, training or handing out work; keep receiving and answering.
+    pause: stop playing, training or assigning work; still receive messages and reply.
     resume: end the pause.
     checkpoint: write to disk what a restart needs.
     stop: end cleanly.
@@ -263,7 +264,7 @@ class Control:
 @message("control_reply", 1, form="json")
 @dataclass(frozen=True)
 class ControlReply:
-    """The answer of one process to a `Control`.
+    """The reply of one process to a `Control`.
 
     Attributes:
         role: role of the process.

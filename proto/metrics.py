@@ -30,13 +30,13 @@ Fraction = Annotated[float, Number(0.0, 1.0)]
 
 @dataclass(frozen=True, kw_only=True)
 class Metrics:
-    """Metrics that all processes have.
+    """Metrics of every process.
 
     Attributes:
         role: role of the process.
         id: id of the process.
         time_s: when the metrics were published (Unix time).
-        refused: number of messages that the process dropped because they were invalid.
+        refused: messages that the process dropped because they were invalid.
     """
 
     role: Role
@@ -51,17 +51,18 @@ class ActorMetrics(Metrics):
     """Metrics of an actor.
 
     Attributes:
-        policy_version: newest policy it holds, 0 for none yet.
+        policy_version: version of its newest policy; 0 if it has none.
         steps_per_s: control steps per second since the last metrics.
-        episodes: episodes it has finished since it started.
-        last_outcome: reason of the last episode, `none` for a precise success; null at first.
-        last_kind: why the last episode was played; null at first.
-        backend: its simulator.
-        outbox: episodes without a receipt.
-        put_aside: messages of the outbox that are kept on disk but not sent any more, because the
-            receiver refused them or the file is damaged.
+        episodes: episodes finished since it started.
+        last_outcome: reason of the last episode, `none` for a precise success; null before the
+            first episode.
+        last_kind: why the last episode was played; null before the first episode.
+        backend: name of its simulator.
+        outbox: episodes that wait for a receipt.
+        put_aside: messages of the outbox that are kept on disk but not sent, because the receiver
+            refused them or the file is damaged.
         failed: episodes whose simulation failed since the process started.
-        paused: whether it was asked to pause.
+        paused: whether it is paused.
     """
 
     role: Role = Role.ACTOR
@@ -94,18 +95,19 @@ class LearnerMetrics(Metrics):
     Attributes:
         stage: waiting for sequences or corrections, pretraining, coupled training, or finished.
         epoch: epochs done in this stage.
-        epochs_total: epochs that this stage has.
-        loss: loss of the last epoch; null at first.
-        sequences: sequences that it stores, including those of pre-training.
-        round: round of corrections that it waits for or learns from, 0 before the first.
-        corrections: corrections of this round that it stores; 0 unless it waits for them.
-        corrections_total: corrections that this round has at most; 0 unless it waits for them.
-        given_up: tutored cases and corrections that are not asked for any more, because their
-            simulation failed again and again; counted since the process started.
+        epochs_total: number of epochs of this stage.
+        loss: loss of the last epoch; null before the first.
+        sequences: stored sequences, including those of pre-training.
+        round: number of the current round of corrections; 0 before the first.
+        corrections: stored corrections of this round; 0 unless the stage is `waiting`.
+        corrections_total: largest number of corrections of this round; 0 unless the stage is
+            `waiting`.
+        given_up: tutored cases and corrections that are no longer requested, because their
+            simulation failed repeatedly; counted since the process started.
         epochs_per_s: epochs per second since the last metrics.
-        policy_version: newest version published, 0 for none yet.
-        paused: whether it was asked to pause.
-        done: whether what the configuration's `done` asks of the learner is reached.
+        policy_version: newest published version; 0 if there is none.
+        paused: whether it is paused.
+        done: whether the learner's part of the configuration's `done` is reached.
     """
 
     role: Role = Role.LEARNER
@@ -126,12 +128,12 @@ class LearnerMetrics(Metrics):
 
 @dataclass(frozen=True)
 class Success:
-    """How many trials succeeded, in one of the readings of success.
+    """Number of successful trials in one reading of success.
 
     Attributes:
         successes: number of successful trials.
-        rate: their share of all trials.
-        wilson95: low and high end of the 95 % Wilson interval of the rate.
+        rate: fraction of the trials that succeeded.
+        wilson95: lower and upper end of the 95 % Wilson interval of the rate.
     """
 
     successes: Count
@@ -145,9 +147,9 @@ class PolicyScore:
 
     Attributes:
         version: the policy version.
-        trials: trials counted, at least one.
+        trials: number of counted trials, at least one.
         lenient, strict, precise: see `proto.episode.Outcome`.
-        reasons: how many trials fell short of `precise`, by reason.
+        reasons: number of trials that were not precise, by reason.
     """
 
     version: Count
@@ -164,10 +166,10 @@ class EvaluatorMetrics(Metrics):
     """Metrics of the evaluator.
 
     Attributes:
-        policies: counts of each policy version that was tried, oldest first.
+        policies: the score of each policy version with counted trials, oldest first.
         leases: trials that are being played.
-        paused: whether it was asked to pause.
-        done: whether what the configuration's `done` asks of the evaluator is reached.
+        paused: whether it is paused.
+        done: whether the evaluator's part of the configuration's `done` is reached.
     """
 
     role: Role = Role.EVALUATOR
@@ -187,7 +189,7 @@ class RecorderMetrics(Metrics):
     Attributes:
         episodes: episodes written since it started.
         bytes: bytes written since it started.
-        dropped: rollouts that it did not record, because too many waited or writing failed.
+        dropped: rollouts that were not recorded, because its queue was full or writing failed.
     """
 
     role: Role = Role.RECORDER
@@ -202,7 +204,7 @@ class HubMetrics(Metrics):
     """Metrics of the hub.
 
     Attributes:
-        peers: sessions connected to it.
+        peers: number of Zenoh sessions that are connected to it.
     """
 
     role: Role = Role.HUB

@@ -1,1 +1,1 @@
-"""What decides the robot's actions: the tutor, baselines and trained networks."""
+"""Policies, which choose the robot's actions: the tutor, baselines and trained networks."""

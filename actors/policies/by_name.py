@@ -1,4 +1,4 @@
-"""Policies by name: the tutor, the task's baselines, trained networks, and one's own."""
+"""Makes policies by name: the tutor, the task's baselines, trained networks, user's classes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def make_policy(name: str, task: Task) -> Policy:
 
     Args:
         name: `tutor`, a baseline of the task, the path of a checkpoint, `pretrained:NAME`, or a
-            class of one's own as `package.module:Class`, which is called without arguments.
+            user's class as `package.module:Class`, which is called without arguments.
         task: the task that is played.
 
     Raises:
@@ -35,9 +35,9 @@ def make_policy(name: str, task: Task) -> Policy:
         return PlannedPolicy(name, task, task.baselines[name])
     path = checkpoint_path(name)
     if path.is_file():
-        return _trained(path, task)
+        return _load_network(path, task)
     if ":" in name:
-        return _own(name)
+        return _make_own(name)
     raise UserError(
         f"policy {name!r}: no such policy or checkpoint file. There are: "
         f"{', '.join(['tutor', *task.baselines, *pretrained_names()])}, the path of a .safetensors"
@@ -49,7 +49,7 @@ def check_task(checkpoint: Checkpoint, task: str, origin: str) -> None:
     """Refuse a network that was trained for another task.
 
     Raises:
-        UserError: it was; the message names both tasks.
+        UserError: the network was trained for another task; the message names both tasks.
     """
     trained_for = checkpoint.metadata.task
     if trained_for is not None and trained_for != task:
@@ -59,15 +59,15 @@ def check_task(checkpoint: Checkpoint, task: str, origin: str) -> None:
         )
 
 
-def _own(name: str) -> Policy:
-    """A policy of the user's own; its attributes may be the class's or the object's."""
+def _make_own(name: str) -> Policy:
+    """Make a policy of a user's class; check its attributes on the object, which may set them."""
     policy: Policy = load_class("--policy", name, {}, _METHODS)()
     check_attributes("--policy", name, policy, _ATTRIBUTES)
     return policy
 
 
-def _trained(path: Path, task: Task) -> Policy:
-    """VMDNN, or one of the networks that it is compared with."""
+def _load_network(path: Path, task: Task) -> Policy:
+    """Load a checkpoint of VMDNN or of a network that it is compared with."""
     checkpoint, origin = load_checkpoint(path), f"checkpoint {path}"
     check_task(checkpoint, task.name, origin)
     if checkpoint.metadata.rival is None:

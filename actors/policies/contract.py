@@ -1,4 +1,4 @@
-"""What decides the robot's actions: the tutor, a baseline or a trained network."""
+"""The interface of policies, which choose the robot's actions."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from proto.variables import Situation
 
 
 class Policy(Protocol):
-    """Chooses one action each control step.
+    """Chooses one action in each control step.
 
     Attributes:
-        name: what it is called in files and results.
-        version: policy version; 0 for what was never trained.
-        looks: whether it uses the picture; if not, nothing need be rendered.
-        target: (11,) what the last action was meant to be, where noise was added to it; else None.
-        outputs: (110,) softmax outputs behind the last action, or None.
+        name: its name in files and results.
+        version: policy version; 0 if it is not trained.
+        looks: whether it uses the picture. If not, the picture need not be rendered.
+        target: (11,) the action to learn in place of the last action, such as the action before
+            noise was added; None if the last action itself is to be learned.
+        outputs: (110,) softmax outputs from which the last action was decoded, or None.
     """
 
     name: str
@@ -29,15 +30,19 @@ class Policy(Protocol):
     outputs: Floats | None
 
     def begin(self, situation: Situation, seed: int) -> None:
-        """Start an episode. Only the tutor and the baselines may look at the situation."""
+        """Start an episode. Only the tutor and the baselines may use the situation."""
 
     def step(self, image: Image) -> NDArray[np.float64]:
-        """Next action (11,), see `proto.body`, for the picture (48, 64) uint8 seen now."""
+        """Return the action (11,) for the current picture (48, 64) uint8, see `proto.body`."""
 
 
 @runtime_checkable
 class StatefulPolicy(Policy, Protocol):
-    """A policy whose inside can be looked into."""
+    """A policy whose internal states can be recorded."""
 
     def states(self, images: Image) -> States:
-        """Activity (T, units) of its parts by name, in an episode with the pictures images."""
+        """Return the activity (T, units) of each subnet by name in an episode.
+
+        Args:
+            images: (T, 48, 64) uint8, the pictures of the episode.
+        """

@@ -1,4 +1,4 @@
-"""Tutoring a policy while it acts: the tutor lets it go its way, but not far."""
+"""A policy that acts under guidance: the tutor limits its distance from the plan."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from proto.variables import Situation
 
 Array = NDArray[np.float64]
 
-# Levels: enough to close the hand or to focus a step too early or too late, as learners do.
+# Levels. They allow the policy to close the hand or to focus about one step early or late.
 GRASP_SLACK: Final = 1.0
 FOCUS_SLACK: Final = 1.5
 
 
 class GuidedPolicy:
-    """A policy acts; the tutor holds its actions near the plan, and means the plan.
+    """A policy whose actions are clipped to a range around the tutor's actions.
 
-    What is seen so is what the policy's own errors lead to; what is to be done there, the tutor
-    says (dataset aggregation; Ross et al. 2011). As the tutor guides all the way, every episode
-    shows the whole behaviour, however bad the policy.
+    The robot meets the situations that the policy's errors lead to, and the tutor's actions are
+    recorded as targets for them (dataset aggregation; Ross et al. 2011). Because of the guidance
+    every episode shows the whole behaviour, even if the policy is bad.
 
     Attributes:
-        version: that of the policy that acts.
+        version: version of the policy.
         target: (11,) the tutor's action of the last step.
-        outputs: always None; not they alone made the action.
+        outputs: always None, because the policy's outputs alone do not determine the action.
     """
 
     name = "guided"
@@ -37,7 +37,14 @@ class GuidedPolicy:
     outputs: Floats | None = None
 
     def __init__(self, policy: Policy, tutor: Policy, guidance_deg: float) -> None:
-        """Guide `policy` so that neck and arm stay within guidance_deg of what the tutor does."""
+        """Guide a policy.
+
+        Args:
+            policy: the policy that acts.
+            tutor: the policy that guides.
+            guidance_deg: largest difference between the actions of neck and arm and the tutor's
+                (degrees).
+        """
         self.version = policy.version
         self.target: Array | None = None
         self._policy = policy
@@ -46,11 +53,11 @@ class GuidedPolicy:
         self._slack[GRASP], self._slack[FOCUS] = GRASP_SLACK, FOCUS_SLACK
 
     def begin(self, situation: Situation, seed: int) -> None:
-        """Start an episode for both."""
+        """Start an episode for policy and tutor."""
         self._policy.begin(situation, seed)
         self._tutor.begin(situation, seed)
 
     def step(self, image: Image) -> Array:
-        """Next action (11,): the policy's, as near to the tutor's as is asked."""
-        self.target = meant = self._tutor.step(image)
-        return self._policy.step(image).clip(meant - self._slack, meant + self._slack)
+        """Return the policy's action (11,), clipped to the range around the tutor's action."""
+        self.target = tutored = self._tutor.step(image)
+        return self._policy.step(image).clip(tutored - self._slack, tutored + self._slack)

@@ -1,4 +1,4 @@
-"""Policies that carry out the tutor's plan without looking: the tutor itself, and the baselines."""
+"""Policies that execute a plan and do not use the picture: the tutor and the baselines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from proto.variables import Situation
 
 
 class PlannedPolicy:
-    """A `Policy` that carries out the plan for the situation that it believes in."""
+    """A `Policy` that executes the task's plan for the situation that it assumes."""
 
     version = 0
     looks = False
@@ -22,10 +22,11 @@ class PlannedPolicy:
         """Make a policy.
 
         Args:
-            name: what it is called in files and results.
-            task: whose plans it carries out.
-            belief: what it takes a situation for.
-            noise: adds execution noise to the actions, never to the targets.
+            name: its name in files and results.
+            task: task whose plans it executes.
+            belief: maps the real situation to the situation that the policy assumes.
+            noise: settings of the execution noise, which is added to the actions but not to the
+                targets; None for no noise.
         """
         self.name = name
         self.target: Array | None = None
@@ -35,7 +36,7 @@ class PlannedPolicy:
         self._step = 0
 
     def begin(self, situation: Situation, seed: int) -> None:
-        """Plan the episode; `seed` is that of the execution noise."""
+        """Plan the episode; `seed` is the seed of the execution noise."""
         self._plan = self._task.plan(self._belief(situation))
         self._actions = self._plan
         if self._noise is not None:
@@ -44,8 +45,8 @@ class PlannedPolicy:
             )
         self._step = 0
 
-    def step(self, image: Image) -> Array:  # noqa: ARG002 - it does not look
-        """Next action (11,) of the plan."""
+    def step(self, image: Image) -> Array:  # noqa: ARG002 - it follows the plan
+        """Return the next action (11,) of the plan."""
         self.target = self._plan[self._step]
         action: Array = self._actions[self._step]
         self._step += 1
@@ -53,5 +54,5 @@ class PlannedPolicy:
 
 
 def make_tutor(task: Task, noise: TutorConfig | None = None) -> PlannedPolicy:
-    """The tutor, who knows the situation; with noise for repeated tutoring of the same case."""
+    """Make the tutor, which knows the situation; with `noise` its execution is disturbed."""
     return PlannedPolicy("tutor", task, lambda situation: situation, noise)

@@ -1,1 +1,1 @@
-"""The tasks of the paper, one folder each, and the registry that finds them by name."""
+"""The paper's tasks, one folder each, and the registry that makes them by name."""

@@ -1,7 +1,7 @@
-"""What a task is. A task is one class in a folder of its own; everything it knows stays there.
+"""The interface of tasks. A task is one class in a folder of its own.
 
-A task names its variables and phases, gives the scene of each situation, plans what the tutor does
-in it, and judges how an episode went. Nothing outside the task's folder knows what it is about.
+A task defines its variables and phases, the scene of each situation, the tutor's plan for it, and
+the judge of an episode. Code outside the task's folder does not depend on what the task is about.
 """
 
 from __future__ import annotations
@@ -32,37 +32,37 @@ from proto.variables import (
 
 Array = NDArray[np.float64]
 Belief = Callable[[Situation], Situation]
-"""What a policy without eyes takes a situation for."""
+"""Maps the real situation to the situation that a baseline assumes."""
 
 
 class Judge(Protocol):
-    """Watches one episode and reads its success."""
+    """Observes one episode and judges its outcome."""
 
     def watch(self, report: StepReport, joints_deg: Array, bodies: Mapping[str, Pose]) -> None:
-        """Take note of one control step that has just been run.
+        """Record one control step after it was simulated.
 
         Args:
-            report: what touched what during the step.
+            report: the contacts during the step.
             joints_deg: (18,) measured joints after the step.
             bodies: true poses after the step, by name.
         """
 
     def outcome(self) -> Outcome:
-        """How the episode went, once its last step was watched."""
+        """Judge the episode; to be called after its last step was recorded."""
 
 
 @dataclass(frozen=True)
 class GraspError:
-    """An error of a policy at the moment of the grasp, as figures show it.
+    """A position or orientation error of the grasp that figures show.
 
     Attributes:
         name: its name in tables and JSON.
-        label: what an axis calls it, with its unit.
-        allowed: about how large it may be in a precise grasp.
-        measure: reads it from an outcome and its situation.
-        variable: the variable of which it shows whether a policy snaps to tutored values; None if
-            it shows that of none.
-        per_unit: how much of the error corresponds to one unit of that variable.
+        label: axis label with the unit.
+        allowed: approximate largest magnitude of the error in a precise grasp.
+        measure: returns the error, given an outcome and its situation.
+        variable: the variable whose error in perception causes this error; None if there is no
+            such variable. Figures use it to show whether a policy prefers tutored values.
+        per_unit: change of the error for a change of that variable by one unit.
     """
 
     name: str
@@ -75,13 +75,13 @@ class GraspError:
 
 @dataclass(frozen=True)
 class FigureWords:
-    """What figures must know of a task.
+    """Labels and errors of a task that figures show.
 
     Attributes:
-        reasons: what to call each reason of failure, from the least to the most serious.
-        errors: the errors at the grasp.
-        in_place: whether the object was still in its place when the hand closed, so that the errors
-            at the grasp mean something.
+        reasons: label of each reason of an outcome, from the least to the most serious.
+        errors: the errors of the grasp.
+        in_place: returns whether the object had not moved before the hand closed. Errors of the
+            grasp are meaningful only then.
     """
 
     reasons: Mapping[str, str]
@@ -90,21 +90,23 @@ class FigureWords:
 
 
 class Task(ABC):
-    """A task; subclasses give the class attributes and the abstract methods.
+    """A task. Subclasses define the class attributes and the abstract methods.
 
     Attributes:
-        name: what it is called in configurations and files: the name of a built-in task, or
+        name: its name in configurations and files: the name of a built-in task, or
             `package.module:Class`.
-        variables: what differs between situations.
-        subtasks: control steps of each phase, by the phase's name, in their order.
+        variables: the variables that differ between situations.
+        subtasks: number of control steps of each phase by name, in the order of the phases.
         start: (11,) the action whose posture every episode starts from (see `proto.body`).
-        questions: what pre-training asks about the variables; empty if it cannot be pre-trained on.
-        baselines: what each baseline takes a situation for, by the baseline's name. A baseline does
-            what the tutor would do in the situation that it believes in.
-        figure_words: what figures must know.
-        options: names of the options that the task takes in the section `task` of a configuration,
-            besides name and attention.
-        attention: if `fixed`, neck and focus stay as in `start`, whatever the policy says.
+        questions: the questions about the variables that pre-training learns to answer; empty if
+            the task cannot be used for pre-training.
+        baselines: by name, the situation that a baseline assumes. A baseline executes the tutor's
+            plan for this situation.
+        figure_words: labels and errors for figures.
+        options: names of the task's options in the section `task` of a configuration, besides name
+            and attention.
+        attention: `active`, or `fixed`: neck and focus stay as in `start`, whatever the policy
+            commands.
     """
 
     name: str
@@ -117,10 +119,10 @@ class Task(ABC):
     options: ClassVar[frozenset[str]] = frozenset()
 
     def __init__(self, config: TaskConfig) -> None:
-        """Make the task as the configuration's section `task` says.
+        """Make the task from the section `task` of a configuration.
 
         Raises:
-            UserError: the section holds an option that the task does not have.
+            UserError: the section contains an option that the task does not have.
         """
         self.attention = config.attention
         if unknown := config.options.keys() - self.options:
@@ -131,19 +133,19 @@ class Task(ABC):
 
     @abstractmethod
     def tutored(self) -> Sequence[Situation]:
-        """The situations that are tutored, always in the same order."""
+        """Return the tutored situations, always in the same order."""
 
     @abstractmethod
     def scene(self, situation: Situation) -> Scene:
-        """What the simulator plays in a situation."""
+        """Return the scene of a situation, for the simulator."""
 
     @abstractmethod
     def plan(self, situation: Situation) -> Array:
-        """What the tutor does in a situation: actions (T, 11), see `proto.body`."""
+        """Return the tutor's actions (T, 11) in a situation, see `proto.body`."""
 
     @abstractmethod
     def judge(self, situation: Situation) -> Judge:
-        """A judge for one episode of a situation."""
+        """Return a judge for one episode in a situation."""
 
     @property
     def phase_names(self) -> tuple[str, ...]:
@@ -152,21 +154,29 @@ class Task(ABC):
 
     @cached_property
     def phases(self) -> NDArray[np.uint8]:
-        """(T,) uint8, index of the phase of each control step."""
+        """Index (T,) uint8 of the phase of each control step."""
         return np.repeat(
             np.arange(len(self.subtasks), dtype=np.uint8), list(self.subtasks.values())
         )
 
     def sample(self, seed: int) -> Situation:
-        """A situation that was drawn from the variables; the same seed gives the same one."""
+        """Draw a random situation; the same seed gives the same situation."""
         return sample_situation(self.variables, seed)
 
     def check(self, situation: Situation) -> None:
-        """Raise UserError unless the situation gives each variable a value that it can have."""
+        """Check that a situation has a valid value for each variable.
+
+        Raises:
+            UserError: a value is missing, unknown or not valid.
+        """
         check_situation(situation, self.variables, self.name)
 
     def corners(self) -> Sequence[Situation]:
-        """The situations at the ends of all ranges, for each choice of the discrete variables."""
+        """Return the situations at the corners of the variables' ranges.
+
+        They are all combinations of the minimum and maximum of each continuous variable and the
+        choices of each discrete variable.
+        """
         ends: list[Sequence[Value]] = [
             (variable.minimum, variable.maximum)
             if isinstance(variable, Continuous)

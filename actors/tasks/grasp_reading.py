@@ -1,4 +1,4 @@
-"""What judges read from the hand and an object: when the hand closed, and where it was."""
+"""Measurements for judges: when the hand closed, and its pose relative to an object."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sim_assets.hand import GRASP_AXIS, GRASP_CENTRE_M, closing_fraction
 Array = NDArray[np.float64]
 
 CLOSED_FRACTION: Final = 0.15
-"""From this fraction of its stroke on the hand counts as closed."""
+"""The hand counts as closed from this fraction of its closing movement on."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,10 @@ class HandOffset:
     """Pose of the hand relative to an object.
 
     Attributes:
-        yaw_error_deg: yaw of the hand's grasp axis less the object's, in the task frame, -90..90.
+        yaw_error_deg: yaw of the hand's grasp axis minus yaw of the object, in the task frame,
+            -90..90.
         along_mm: offset of the grasp centre along the object's long axis.
-        across_mm: offset across it.
+        across_mm: horizontal offset of the grasp centre across the object's long axis.
     """
 
     yaw_error_deg: float
@@ -35,7 +36,7 @@ class HandOffset:
 
 
 def closed_at(joints_deg: Iterable[Array]) -> int:
-    """First step from which the hand stays closed to the end, or -1.
+    """Return the first step from which the hand stays closed to the end, or -1.
 
     Args:
         joints_deg: measured joints (18,) after each step.
@@ -50,42 +51,42 @@ def closed_at(joints_deg: Iterable[Array]) -> int:
 
 
 def hand_offset(hand: Pose, body: Pose) -> HandOffset:
-    """Where the hand is relative to an object."""
+    """Compute the pose of the hand relative to an object."""
     body_yaw_deg = yaw_deg(body)
     axis = rotation_of(hand).apply(GRASP_AXIS)
     hand_yaw_deg = float(np.rad2deg(np.arctan2(axis[1], axis[0])))
     centre = grasp_centre_m(hand) - body.position_m
     turn = np.deg2rad(body_yaw_deg)
     return HandOffset(
-        yaw_error_deg=half_turn(body_yaw_deg - hand_yaw_deg),  # task frame: yaw turns the other way
+        yaw_error_deg=half_turn(body_yaw_deg - hand_yaw_deg),  # the task frame is left-handed
         along_mm=1e3 * float(-centre[0] * np.sin(turn) + centre[1] * np.cos(turn)),
         across_mm=1e3 * float(centre[0] * np.cos(turn) + centre[1] * np.sin(turn)),
     )
 
 
 def grasp_centre_m(hand: Pose) -> Array:
-    """Grasp centre (3,) of the hand in the world frame."""
+    """Return the grasp centre (3,) of the hand in the world frame."""
     return np.asarray(hand.position_m + rotation_of(hand).apply(GRASP_CENTRE_M))
 
 
 def rotation_of(pose: Pose) -> Rotation:
-    """The rotation of a pose."""
+    """Return the rotation of a pose."""
     w, x, y, z = pose.quaternion
     return Rotation.from_quat((x, y, z, w))
 
 
 def yaw_deg(pose: Pose) -> float:
-    """Turn of a pose about the vertical, in the world frame."""
+    """Return the rotation of a pose about the vertical, in the world frame (degrees)."""
     w, x, y, z = pose.quaternion
     return float(np.rad2deg(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
 
 
 def tilt_deg(pose: Pose) -> float:
-    """Angle between a body's own z axis and the vertical."""
+    """Return the angle between the z axis of a body and the vertical (degrees)."""
     _, x, y, _ = pose.quaternion
     return float(np.rad2deg(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1.0, 1.0))))
 
 
 def half_turn(angle_deg: float) -> float:
-    """The angle folded into -90..90 degrees: a box looks the same after half a turn."""
+    """Reduce an angle to -90..90 degrees; a box looks the same after a rotation by 180 degrees."""
     return (angle_deg + 90.0) % 180.0 - 90.0

@@ -1,4 +1,4 @@
-"""Tasks by name: the built-in ones, and those of one's own as `package.module:Class`."""
+"""Makes tasks by name: built-in tasks, and users' classes as `package.module:Class`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ATTRIBUTES: Final = (
 
 
 def make_pretraining_task(config: Config) -> Task:
-    """The task whose sequences pre-training learns from."""
+    """Make the task whose sequences are used for pre-training."""
     return make_task(config.task_called(config.pretraining_task or config.task.name))
 
 
@@ -30,10 +30,11 @@ def make_task(config: TaskConfig) -> Task:
     """Make the task that the section `task` of a configuration names.
 
     Raises:
-        UserError: there is no such task, its class lacks something, or an option is unknown.
+        UserError: there is no such task, its class lacks a method or an attribute, or an option is
+            unknown.
     """
     made = load_class("task.name", config.name, TASKS, _METHODS)
-    made.name = config.name  # recordings carry it, so that the task is found again
+    made.name = config.name  # recordings store it, so that the task can be made from them
     task: Task = made(config)
     check_attributes("task.name", config.name, task, _ATTRIBUTES)
     return task

@@ -1,1 +1,1 @@
-"""How fast training is, and the step-by-step reference that it is measured against."""
+"""The speed of training, and the step-by-step reference that it is compared with."""

@@ -1,1 +1,1 @@
-"""C++ kernels, compiled for the processor at hand, and their bindings."""
+"""C++ kernels, compiled for this machine's processor, and their bindings: arrays in, arrays out."""

@@ -84,7 +84,7 @@ def mix(
 
     Raises:
         ValueError: the sizes do not fit together.
-        IndexError: a member is none of the S sequences.
+        IndexError: an index in `members` is outside 0..S - 1.
     """
     _check(members, weights, seen, targets, code)
     count, parts = members.shape

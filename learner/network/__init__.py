@@ -1,1 +1,1 @@
-"""The network VMDNN: its subnets, its outputs' code, and the form that acts."""
+"""The network VMDNN: its subnets, the code of its outputs, and the networks that act."""

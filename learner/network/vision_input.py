@@ -1,4 +1,4 @@
-"""V_I: the grey picture as the network sees it."""
+"""V_I: the input of the vision, from a grey image."""
 
 from __future__ import annotations
 

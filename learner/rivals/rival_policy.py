@@ -61,7 +61,7 @@ class RivalPolicy:
         self._state = None
 
     def step(self, image: Image) -> NDArray[np.float64]:
-        """Next action (11,), within what the robot accepts, for the picture (48, 64) uint8."""
+        """Next action (11,), within what the robot accepts, for the image (48, 64) uint8."""
         with torch.no_grad():
             seen = self._network.see(torch.from_numpy(vision_input(image))[None, None])
             log_outputs, self._state = self._network.act(seen, self._state)

@@ -1,1 +1,1 @@
-"""Episodes as MCAP files: written, read, and recovered."""
+"""Episodes as MCAP files: writing, reading and recovery."""

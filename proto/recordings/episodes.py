@@ -1,15 +1,15 @@
-"""Episodes on disk: one MCAP file each, lossless, that Foxglove opens.
+"""Writes and reads episodes: one lossless MCAP file each, which Foxglove can open.
 
-| topic | schema | what |
+| topic | schema | content |
 |---|---|---|
 | `/eye` | foxglove.CompressedImage | images[t] as PNG |
-| `/joints` | foxglove.JointStates | joints_deg[t], in radians as the schema asks |
+| `/joints` | foxglove.JointStates | joints_deg[t], in radians, the unit of the schema |
 | `/tf` | foxglove.FrameTransforms | body_poses[t], each body a frame in `world` |
-| `/states` | vmdnn.States | states[t] of each subnet; only where they were asked for |
+| `/states` | vmdnn.States | states[t] of each subnet; only if the episode has states |
 | `/step` | vmdnn.Step | phases[t], actions[t], targets[t], outputs[t]; ends step t |
 
-Step t is logged at t control periods. Everything else stands in four metadata records before the
-first message: `episode`, `situation`, `outcome` and `measures`.
+Step t has the log time t * control_period_s. All other fields are in four metadata records before
+the first message: `episode`, `situation`, `outcome` and `measures`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from proto.recordings.schemas import (
 from proto.storage import written_whole
 
 FORMAT: Final = 2
-"""Format of the files that are written; those of format 1 can be read, too."""
+"""Format of the files that are written; files of format 1 can be read too."""
 EYE: Final = "/eye"
 JOINTS: Final = "/joints"
 TRANSFORMS: Final = "/tf"
@@ -64,7 +64,7 @@ TOPICS: Final[Mapping[str, type[Message]]] = {
 
 _READINGS: Final = ("lenient", "strict", "precise")
 
-# A kill while an episode is written costs at most one chunk, some ten steps.
+# If the process is killed while it writes, at most one chunk is lost, about ten steps.
 CHUNK_BYTES: Final = 64 * 1024
 DAMAGE: Final = (
     McapError,
@@ -75,14 +75,14 @@ DAMAGE: Final = (
     MemoryError,
     OverflowError,
 )
-"""What reading the records of a file that is cut off, or damaged otherwise, raises."""
+"""Exceptions raised by reading the records of a truncated or damaged file."""
 
 
 def write_episode(path: Path, episode: Episode) -> None:
-    """Write an episode; the file appears under its name only once it is whole.
+    """Write an episode; the file appears under its name only when it is complete.
 
     Raises:
-        UserError: the file cannot be written there.
+        UserError: the file cannot be written.
     """
     with written_whole(path) as stream:
         writer = Writer(stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
@@ -106,11 +106,11 @@ def read_episode(path: Path, *, partial: bool = False) -> Episode:
 
     Args:
         path: the MCAP file.
-        partial: accept what `vmdnn recover` saved of a file that was cut off. Such an episode has
-            fewer steps than were played; its outcome is the one it had when it was whole.
+        partial: accept an episode that `vmdnn recover` restored from a truncated file. It has
+            fewer steps than were played, but the outcome of the whole episode.
 
     Raises:
-        UserError: the file is missing, cut off, damaged, no episode, or recovered in part.
+        UserError: the file is missing, truncated, damaged, not an episode, or recovered in part.
     """
     contents = _contents(path)
     _check_format(path, contents)
@@ -140,7 +140,7 @@ def _check_steps(path: Path, steps: int, expected: int) -> None:
 
 @dataclass(frozen=True)
 class EpisodeSummary:
-    """What tells one recorded episode from another; see `Episode` for the fields."""
+    """The fields that identify a recorded episode; see `Episode`."""
 
     id: str
     kind: Kind
@@ -151,34 +151,34 @@ class EpisodeSummary:
 
 
 def read_summary(path: Path) -> EpisodeSummary:
-    """Read what an episode is, without decoding its steps; the file is checked as a whole.
+    """Read the summary of an episode; check the whole file, but do not decode its steps.
 
     Raises:
         UserError: as `read_episode`.
     """
     contents = _contents(path)
     try:
-        told = contents.metadata["episode"]
+        texts = contents.metadata["episode"]
         summary = EpisodeSummary(
-            id=told["id"],
-            kind=Kind(told["kind"]),
-            task=told["task"],
-            seed=int(told["seed"]),
-            policy_version=int(told["policy_version"]),
-            training=told.get("training", ""),
+            id=texts["id"],
+            kind=Kind(texts["kind"]),
+            task=texts["task"],
+            seed=int(texts["seed"]),
+            policy_version=int(texts["policy_version"]),
+            training=texts.get("training", ""),
         )
-        _check_steps(path, len(contents.messages[STEP]), int(told["steps"]))
+        _check_steps(path, len(contents.messages[STEP]), int(texts["steps"]))
     except (KeyError, ValueError) as error:
         raise _not_an_episode(path, error) from error
     return summary
 
 
 def records(path: Path) -> Iterator[McapRecord]:
-    """All records of an MCAP file in order, chunks unpacked, checksums checked.
+    """Yield all records of an MCAP file in order; unpack chunks and verify checksums.
 
     Raises:
-        UserError: there is no such file, or it is of another format.
-        one of DAMAGE: after the last whole record, unless the file is whole.
+        UserError: the file cannot be read, or it is not an MCAP file.
+        one of DAMAGE: the file is truncated or damaged after the last record that was yielded.
     """
     try:
         with path.open("rb") as stream:
@@ -231,9 +231,10 @@ def _messages(episode: Episode, step: int, time_ns: int) -> Iterator[tuple[str, 
     for name, pose in zip(episode.body_names, episode.body_poses[step].tolist(), strict=True):
         transform = transforms.transforms.add(parent_frame_id="world", child_frame_id=name)
         transform.timestamp.FromNanoseconds(time_ns)
-        at, turn = transform.translation, transform.rotation
-        at.x, at.y, at.z, turn.w, turn.x, turn.y, turn.z = pose
-    told = Step(
+        position, rotation = transform.translation, transform.rotation
+        position.x, position.y, position.z = pose[:3]
+        rotation.w, rotation.x, rotation.y, rotation.z = pose[3:]
+    step_message = Step(
         step=step,
         phase=int(episode.phases[step]) + 1,
         phase_name=episode.phase_names[episode.phases[step]],
@@ -249,32 +250,32 @@ def _messages(episode: Episode, step: int, time_ns: int) -> Iterator[tuple[str, 
         for name, activity in episode.states.items():
             states.subnets.add(name=name, activity=activity[step].tolist())
         yield STATES, states
-    yield STEP, told
+    yield STEP, step_message
 
 
 def _episode(contents: _Contents) -> Episode:
-    told = contents.metadata["episode"]
-    names = tuple(json.loads(told["body_names"]))
-    # `/step` ends a step, so each of its messages stands for a whole one.
+    texts = contents.metadata["episode"]
+    names = tuple(json.loads(texts["body_names"]))
+    # `/step` is the last message of a step, so a step with a `/step` message is complete.
     steps = [Step.FromString(data) for data in contents.messages[STEP]]
     count = len(steps)
-    outputs_size = json.loads(told["outputs"])
+    outputs_size = json.loads(texts["outputs"])
     return Episode(
-        id=told["id"],
-        kind=Kind(told["kind"]),
-        task=told["task"],
+        id=texts["id"],
+        kind=Kind(texts["kind"]),
+        task=texts["task"],
         situation={k: json.loads(v) for k, v in contents.metadata["situation"].items()},
-        seed=int(told["seed"]),
-        actor=told["actor"],
-        backend=told["backend"],
-        policy=told["policy"],
-        policy_version=int(told["policy_version"]),
-        config_digest=told["config_digest"],
+        seed=int(texts["seed"]),
+        actor=texts["actor"],
+        backend=texts["backend"],
+        policy=texts["policy"],
+        policy_version=int(texts["policy_version"]),
+        config_digest=texts["config_digest"],
         images=_images(contents.messages[EYE][:count]),
         actions=_floats([_action(step.action) for step in steps], (count, len(ACTION_NAMES))),
         targets=_floats([_action(step.target) for step in steps], (count, len(ACTION_NAMES))),
         joints_deg=_joints_deg(contents.messages[JOINTS][:count]),
-        phase_names=_phase_names(told),
+        phase_names=_phase_names(texts),
         phases=np.array([step.phase - 1 for step in steps], dtype=np.uint8),
         body_names=names,
         body_poses=_poses(contents.messages[TRANSFORMS][:count], len(names)),
@@ -282,9 +283,9 @@ def _episode(contents: _Contents) -> Episode:
         outputs=None
         if outputs_size is None
         else _floats([step.outputs for step in steps], (count, outputs_size)),
-        control_period_s=float(told["control_period_s"]),
-        states=_states(contents.messages[STATES][:count], json.loads(told.get("states", "null"))),
-        training=told.get("training", ""),  # recordings made before there was this field lack it
+        control_period_s=float(texts["control_period_s"]),
+        states=_states(contents.messages[STATES][:count], json.loads(texts.get("states", "null"))),
+        training=texts.get("training", ""),  # older recordings do not have this field
     )
 
 
@@ -311,7 +312,7 @@ def _episode_texts(episode: Episode) -> dict[str, str]:
 
 
 def _states_text(episode: Episode) -> dict[str, str]:
-    """Number of units by subnet; nothing where no states are kept, as before there were any."""
+    """Number of units by subnet; no entry if the episode has no states, as in older files."""
     if episode.states is None:
         return {}
     units = {name: activity.shape[1] for name, activity in episode.states.items()}
@@ -343,18 +344,18 @@ def _outcome(metadata: Mapping[str, Mapping[str, str]]) -> Outcome:
     return Outcome(lenient, strict, precise, texts["reason"], measures)
 
 
-def _phase_names(told: Mapping[str, str]) -> tuple[str, ...]:
-    if told["format"] == "1":
+def _phase_names(texts: Mapping[str, str]) -> tuple[str, ...]:
+    if texts["format"] == "1":
         return format1.phase_names()
-    return tuple(str(name) for name in json.loads(told["phase_names"]))
+    return tuple(str(name) for name in json.loads(texts["phase_names"]))
 
 
 def _check_format(path: Path, contents: _Contents) -> None:
-    """Refuse a file of a format that this version does not know."""
+    """Refuse a file whose format is newer than this version of vmdnn."""
     try:
         number = _format_of(contents.metadata)
     except (KeyError, ValueError):
-        return  # it is no episode, which is told where it is read
+        return  # not an episode: reading its fields raises the error
     if number > FORMAT:
         raise UserError(
             f"{path} is of format {number}, written by a newer vmdnn; this one reads formats up to"
@@ -367,9 +368,9 @@ def _format_of(metadata: Mapping[str, Mapping[str, str]]) -> int:
 
 
 def _png(image: Image) -> bytes:
-    whole, data = cv2.imencode(".png", image)
-    if not whole:
-        raise ValueError(f"an image of shape {image.shape} cannot be made into a PNG")
+    encoded, data = cv2.imencode(".png", image)
+    if not encoded:
+        raise ValueError(f"an image of shape {image.shape} cannot be encoded as PNG")
     return bytes(data)
 
 
@@ -379,7 +380,7 @@ def _images(messages: Sequence[bytes]) -> Image:
         png = np.frombuffer(CompressedImage.FromString(data).data, dtype=np.uint8)
         image = cv2.imdecode(png, cv2.IMREAD_GRAYSCALE)
         if image is None:
-            raise ValueError(f"the picture of step {step} is no PNG")
+            raise ValueError(f"the picture of step {step} is not a PNG")
         images[step] = image
     return images
 
@@ -395,7 +396,7 @@ def _states(messages: Sequence[bytes], units: Mapping[str, int] | None) -> dict[
 
 
 def _radians(joints_deg: Floats) -> list[float]:
-    # In float64, so that rounding to float32 after the way back gives the very same degrees.
+    # In float64, so that converting back to degrees and rounding to float32 is exact.
     radians: list[float] = np.radians(joints_deg.astype(np.float64)).tolist()
     return radians
 
@@ -415,8 +416,13 @@ def _poses(messages: Sequence[bytes], bodies: int) -> Floats:
     poses = []
     for data in messages:
         for transform in FrameTransforms.FromString(data).transforms:
-            at, turn = transform.translation, transform.rotation
-            poses.append((at.x, at.y, at.z, turn.w, turn.x, turn.y, turn.z))
+            position, rotation = transform.translation, transform.rotation
+            poses.append(
+                (
+                    *(position.x, position.y, position.z),
+                    *(rotation.w, rotation.x, rotation.y, rotation.z),
+                )
+            )
     return _floats(poses, (len(messages), bodies, 7))
 
 

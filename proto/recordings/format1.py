@@ -1,6 +1,7 @@
-"""What files of format 1 hold differently: outcomes without a table of measures, unnamed phases.
+"""Reads outcomes and phases of format 1.
 
-Format 1 was written by vmdnn 0.1 before tasks named their own measures and phases.
+Format 1 stores the measures of an outcome without units beside its readings, and phases without
+names. It was written by vmdnn 0.1 before each task defined its measures and phases.
 """
 
 from __future__ import annotations
@@ -11,16 +12,19 @@ from typing import Any, Final
 from proto.episode import Measure, Outcome
 
 _UNITS: Final[Mapping[str, str]] = {"m": "m", "mm": "mm", "deg": "deg", "at": "step"}
-"""Units by the last word of a measure's name."""
+"""Unit of a measure by the last word of its name."""
 _READINGS: Final = ("lenient", "strict", "precise")
 _PHASES: Final = 8
 
 
 def outcome_of(values: Mapping[str, Any]) -> Outcome:
-    """The outcome that a flat table of readings, reason and measures says.
+    """Make an outcome from the values of format 1.
+
+    Args:
+        values: readings, `reason` and measures by name.
 
     Raises:
-        KeyError, TypeError, ValueError: it is no such table.
+        KeyError, TypeError, ValueError: a value is missing or has the wrong type.
     """
     lenient, strict, precise = (bool(values[reading]) for reading in _READINGS)
     measured = {
@@ -32,5 +36,5 @@ def outcome_of(values: Mapping[str, Any]) -> Outcome:
 
 
 def phase_names() -> tuple[str, ...]:
-    """Names for the eight phases, which had numbers only."""
+    """Return names for the eight phases, which have only numbers in format 1."""
     return tuple(f"phase {number}" for number in range(1, _PHASES + 1))

@@ -1,4 +1,4 @@
-"""Saving what is whole of an MCAP file that was cut off."""
+"""Recovery of the complete records of a truncated MCAP file."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from proto.storage import written_whole
 
 @dataclass(frozen=True)
 class Recovered:
-    """What was found whole in a file.
+    """Result of a recovery.
 
     Attributes:
-        intact: the file was whole already.
-        messages: number of messages.
-        steps: number of control steps of the episode.
-        steps_played: how many it had when it was played; None where the file is no episode.
+        intact: the file was complete, so there was nothing to recover.
+        messages: number of complete messages.
+        steps: number of complete control steps of the episode.
+        steps_played: number of control steps that were played; None if the file is not an episode.
     """
 
     intact: bool
@@ -42,19 +42,20 @@ class Recovered:
 
 
 def recover(path: Path, out: Path | None = None) -> Recovered:
-    """Write an MCAP file with all that is whole of another one.
+    """Write an MCAP file with all complete records of another one.
 
     Args:
-        path: any MCAP file. It stays as it is, unless it is also `out`.
-        out: where to write; None: in place of `path`, which is left alone if it is intact.
+        path: any MCAP file. It is not changed, unless it is also `out`.
+        out: the file to write; None replaces `path`, unless `path` is intact.
 
     Raises:
-        UserError: no such file, not MCAP, nothing whole in it, or `out` cannot be written.
+        UserError: `path` cannot be read, is not MCAP or has no complete message, or `out` cannot
+            be written.
     """
     kept, intact = _whole_records(path)
     found = _count(kept, intact)
     if not found.messages:
-        raise UserError(f"{path}: not one message in it is whole, so nothing can be recovered")
+        raise UserError(f"{path} has no complete message, so nothing can be recovered")
     in_place = out is None or out.resolve() == path.resolve()
     if not (intact and in_place):
         with written_whole(out or path) as stream:
@@ -63,9 +64,9 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
 
 
 def _whole_records(path: Path) -> tuple[list[McapRecord], bool]:
-    """The data records before the first damage, and whether there is no damage."""
+    """Return the data records before the first damage, and whether there is no damage."""
     kept: list[McapRecord] = []
-    in_data = True  # what follows the data repeats and indexes it
+    in_data = True  # the records after the data section only repeat and index it
     try:
         for record in records(path):
             in_data = in_data and not isinstance(record, DataEnd)

@@ -1,4 +1,4 @@
-"""Protobuf schemas of a recording: Foxglove's own where it has one, else those made here."""
+"""Protobuf schemas of a recording: Foxglove's schemas, and `Step` and `States` defined here."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _field(number: int, name: str, kind: int, message: str | None = None) -> Fie
 
 
 def _step_file() -> FileDescriptorProto:
-    """What the robot was told in one control step, and what the policy made of it."""
+    """Describe `Step`: the action of one control step, its target and the policy's outputs."""
     action = DescriptorProto(
         name="Action",
         field=[
@@ -69,7 +69,7 @@ def _step_file() -> FileDescriptorProto:
 
 
 def _states_file() -> FileDescriptorProto:
-    """What went on in a network in one control step."""
+    """Describe `States`: the activity of a network's subnets in one control step."""
     activity = _field(2, "activity", FieldDescriptorProto.TYPE_FLOAT)
     activity.label = FieldDescriptorProto.LABEL_REPEATED
     subnet = DescriptorProto(
@@ -88,14 +88,18 @@ def _states_file() -> FileDescriptorProto:
 Default().Add(_step_file())
 Default().Add(_states_file())
 Step: Final = message_factory.GetMessageClass(Default().FindMessageTypeByName("vmdnn.Step"))
-"""One control step: `step`, `action` and `target` (units of `proto.body`), `outputs`, and the phase
-by number, from 1, (`phase`) and by name (`phase_name`)."""
+"""One control step: `step`, `action` and `target` (units of `proto.body`), `outputs`, `phase` (its
+number, from 1) and `phase_name`."""
 States: Final = message_factory.GetMessageClass(Default().FindMessageTypeByName("vmdnn.States"))
 """One control step of a network: `subnets`, each with its `name` and `activity`."""
 
 
 def describe(message: type[Message]) -> bytes:
-    """The schema of a message class as MCAP wants it: a set of files, what each needs before it."""
+    """Serialize the schema of a message class for MCAP: its file and all files that it imports.
+
+    Returns:
+        A serialized FileDescriptorSet; each file comes after those that it imports.
+    """
     files: dict[str, FileDescriptorProto] = {}
 
     def collect(file: FileDescriptor) -> None:

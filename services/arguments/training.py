@@ -1,4 +1,4 @@
-"""What the commands that train without the bus share: their arguments, and Ctrl-C."""
+"""What the commands that train without the bus share: arguments and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ def add_training_data(parser: argparse.ArgumentParser) -> None:
     """Add --data and --pretraining-data."""
     parser.add_argument("--data", type=Path, required=True, help="folder of tutored sequences")
     parser.add_argument(
-        "--pretraining-data", type=Path, help="folder of sequences for pre-training, if others"
+        "--pretraining-data",
+        type=Path,
+        help="folder of sequences for pre-training; without it, those of --data",
     )
 
 
@@ -25,7 +27,7 @@ def training_stores(arguments: argparse.Namespace) -> tuple[TutoringStore, Tutor
     """The sequences that the arguments of `add_training_data` name.
 
     Raises:
-        UserError: a folder is not there, or holds no sequence.
+        UserError: a folder does not exist, or holds no sequence.
     """
     store = filled_store("--data", arguments.data)
     if arguments.pretraining_data is None:
@@ -35,15 +37,19 @@ def training_stores(arguments: argparse.Namespace) -> tuple[TutoringStore, Tutor
 
 @contextmanager
 def interruption() -> Iterator[Callable[[], bool]]:
-    """Tell whether Ctrl-C was pressed, so that an epoch can end; a second one ends at once."""
+    """Catch the first Ctrl-C, so that an epoch can end; the second one interrupts at once.
+
+    Yields:
+        A function that returns whether Ctrl-C was pressed.
+    """
     pressed = False
 
-    def note(_signal: int, _frame: FrameType | None) -> None:
+    def note_ctrl_c(_signal: int, _frame: FrameType | None) -> None:
         nonlocal pressed
         pressed = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    before = signal.signal(signal.SIGINT, note)
+    before = signal.signal(signal.SIGINT, note_ctrl_c)
     try:
         yield lambda: pressed
     finally:
@@ -54,7 +60,7 @@ def filled_store(option: str, folder: Path) -> TutoringStore:
     """The sequences in a folder that an option names.
 
     Raises:
-        UserError: it is not there, or holds none.
+        UserError: it does not exist, or holds no sequence.
     """
     if not folder.is_dir():
         raise UserError(f"{option} {folder} is no folder; record one with `vmdnn tutor --out DIR`")

@@ -170,7 +170,7 @@ def test_it_shows_cases_plays_trials_and_practises(
         TutoringCase("experiment1", 3, 1),
         TutoringCase("reaching", 14, 0),
     ]
-    setup.start_actor()
+    setup.start_actor("--set", "learner.pretraining.task=reaching")
     eventually(lambda: len(setup.sequences) == 3, "three demonstrations")
     clean, noisy, reaching = setup.sequences
     assert (reaching.task, reaching.seed) == ("reaching", 14000)
@@ -185,7 +185,7 @@ def test_it_shows_cases_plays_trials_and_practises(
     told = setup.tells(lambda told: told.episodes == 3 and told.outbox == 0)
     assert told.policy_version == 0
     assert told.last_kind is Kind.TUTORING
-    assert told.last_outcome is reaching.outcome.reason
+    assert told.last_outcome == reaching.outcome.reason
 
     setup.trials.append(Trial(seed=1234))
     setup.publish(policy(1))

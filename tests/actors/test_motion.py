@@ -1,17 +1,17 @@
-"""Movements: timing, curves through postures, noise."""
+"""Movement profiles, interpolation of postures, and execution noise."""
 
 import numpy as np
 import pytest
 
-from actors.motion import execution_noise, minimum_jerk, ramp, travel
+from actors.motion import execution_noise, interpolate_postures, minimum_jerk, ramp
 from proto.body import ARM, FOCUS, GRASP
 
 
 def test_minimum_jerk_starts_and_ends_at_rest():
-    share = np.linspace(-0.5, 1.5, 2001)
-    position = minimum_jerk(share)
-    assert (position[share <= 0] == 0.0).all()
-    assert (position[share >= 1] == 1.0).all()
+    fraction = np.linspace(-0.5, 1.5, 2001)
+    position = minimum_jerk(fraction)
+    assert (position[fraction <= 0] == 0.0).all()
+    assert (position[fraction >= 1] == 1.0).all()
     assert (np.diff(position) >= 0.0).all()
     assert np.abs(np.diff(position, 2)).max() < 1e-4
     assert minimum_jerk(0.5) == pytest.approx(0.5)
@@ -24,12 +24,14 @@ def test_ramp_rises_between_its_start_and_its_length():
     assert (values[12:] == 1.0).all()
 
 
-def test_travel_passes_each_posture_at_even_shares():
+def test_interpolation_passes_each_posture_at_even_spacing():
     postures = [np.full(7, 1.0), np.arange(7.0), np.full(7, -2.0)]
-    np.testing.assert_allclose(travel(postures, np.array([0.0, 0.5, 1.0])), postures, atol=1e-12)
+    np.testing.assert_allclose(
+        interpolate_postures(postures, np.array([0.0, 0.5, 1.0])), postures, atol=1e-12
+    )
 
 
-def test_noise_is_smooth_seeded_and_of_the_size_asked_for():
+def test_noise_is_smooth_and_seeded_and_has_the_given_amplitude():
     noise = np.concatenate([execution_noise(124, seed, 1.0, 20.0) for seed in range(200)])
     late = noise.reshape(200, 124, 11)[:, 40:]
     assert late[..., ARM].std() == pytest.approx(1.0, abs=0.1)

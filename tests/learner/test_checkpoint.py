@@ -115,13 +115,14 @@ def test_tensors_that_do_not_fit(
 def with_image_size(checkpoint: Checkpoint, size: object) -> bytes:
     """The checkpoint as earlier versions wrote it, with an image size among the network's sizes."""
     metadata = checkpoint.metadata.model_dump(mode="json")
+    metadata["format"] = 1
     metadata["network"]["image"] = size
     return save(dict(checkpoint.tensors), {"vmdnn": json.dumps(metadata)})
 
 
 def test_an_image_size_in_older_checkpoints_must_be_the_robots(checkpoint: Checkpoint) -> None:
     older = checkpoint_from_bytes(with_image_size(checkpoint, [64, 48]), "it")
-    assert older.metadata == checkpoint.metadata
+    assert older.metadata.network == checkpoint.metadata.network
     for size in ([48, 64], [32, 24], None, "64x48"):
         with pytest.raises(
             UserError, match=r"it is of a network for images of the size .* 64 x 48"

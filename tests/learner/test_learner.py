@@ -247,7 +247,7 @@ def test_pretraining_has_cases_of_its_own_and_does_not_wait_for_the_others(
     training = checkpoint.metadata.training
     assert training is not None
     assert training.sequences == ("reaching0", "reaching14")
-    assert set(training.classes) == {"object_y_m", "object_yaw_deg"}
+    assert set(training.asked) == {"object_y_m", "object_yaw_deg"}
     assert checkpoint.part("classifier.")["weight"].shape == (3 + 5, 20)
 
     # it goes on with the others once they are there, also after a restart

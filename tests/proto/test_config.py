@@ -47,7 +47,7 @@ def written(folder: Path, text: str) -> Path:
         ("learner: {rate: 1, rate: 2}", "the key 'rate' stands twice"),
         ("run: {seed: 1}\ntutor:\nrun: {seed: 2}", "in line 1 and in line 3"),
         ("{learner: {epoch: 1}}", "did you mean learner.epochs?"),
-        ("tutor: {repeats: 1001}", "must not exceed 1000: a case has so many seeds"),
+        ("tutor: {repeats: 1001}", "must not exceed 1000: each repeat needs one of the 1000 seeds"),
         ("learner: {pretraining: {repeats: 1001}}", "must not exceed 1000"),
         ("run: {folder: ~nobody-of-this-name/runs}", "~ cannot be expanded"),
     ],

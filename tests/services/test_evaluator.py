@@ -10,7 +10,7 @@ from subprocess import Popen
 import pytest
 from outcomes import NOT_LIFTED, PRECISE
 from ports import free_endpoint
-from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
+from processes import PATIENCE_S, eventually, listening_hub, run_vmdnn, stop, vmdnn
 
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig
@@ -72,7 +72,11 @@ class EvaluatorSetup:
 
     def ask(self, actor: Bus, version: int, run_id: str = "training") -> list[int]:
         request = TrialRequest(actor.id, run_id, version)
-        return [trial.seed for trial in actor.ask(actor.keys.request_trial, request, Trial)]
+        key = actor.keys.request_trial
+        given = actor.ask(
+            key, request, Trial, timeout_s=PATIENCE_S
+        )  # a late answer is a lost trial
+        return [trial.seed for trial in given]
 
     def ask_until_given(self, actor: Bus, version: int) -> int:
         seeds: list[int] = []

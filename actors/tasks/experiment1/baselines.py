@@ -1,4 +1,4 @@
-"""Baselines of Experiment I: what each takes a situation for. None of them looks."""
+"""Baselines of Experiment I: the situation that each assumes. They do not use the picture."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def _nearest_tutored(situation: Situation) -> Situation:
 
 
 BASELINES: Final[Mapping[str, Belief]] = {
-    # one fixed sequence, whatever the situation
+    # one fixed sequence in every situation
     "replay": lambda _: MIDDLE,
     # the right place, always the same orientation
     "yaw-blind": lambda situation: {**situation, "object_yaw_deg": 0.0},
     # the right object, always the same obstacle
     "obstacle-blind": lambda situation: {**situation, "obstacle_x_m": MIDDLE["obstacle_x_m"]},
-    # perfect sight, but only the 45 tutored sequences: what a network must pass to generalize
+    # the tutored sequence nearest to the real situation: a network that generalizes must be better
     "lookup": _nearest_tutored,
 }

@@ -1,4 +1,4 @@
-"""What figures say about Experiment I."""
+"""Labels and grasp errors of Experiment I for figures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def _measured(name: str) -> Callable[[Outcome, Situation], float]:
 
 
 def _offset_in_y_mm(outcome: Outcome, situation: Situation) -> float:
-    """Offset of the hand from the object in Y of the task frame."""
+    """Offset of the hand from the object along Y of the task frame."""
     turn = np.deg2rad(number_of(situation, "object_yaw_deg"))
     along, across = outcome.value("along_mm"), outcome.value("across_mm")
     return float(along * np.cos(turn) - across * np.sin(turn))

@@ -1,10 +1,10 @@
-"""Fits the tutor's key postures to the task.
+"""Fits the tutor's key postures of Experiment I and writes postures.json.
 
-Run once, with `python -m actors.tasks.experiment1.fitting`.
+To be run once, with `python -m actors.tasks.experiment1.fitting`.
 
-Each key posture is a polynomial of the situation. `actors.posture_fitting` finds its coefficients
-over a grid of situations at once: the hand where it should be, clear of everything it must not
-touch, within the joints' limits.
+Each key posture is a polynomial of the situation. `actors.posture_fitting` fits its coefficients to
+a grid of situations together. The residuals require the right pose of the hand, clearance from
+obstacles and table, and angles within the joint limits.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.kinematics import Arm, ArmPose, ClearanceBox
-from actors.motion import travel
+from actors.motion import interpolate_postures
 from actors.posture_fitting import (
     ANGLE,
     LIMIT,
@@ -56,14 +56,14 @@ DESCENT_M: Final = 0.085
 LIFT_M: Final = 0.11
 STEEPEST_APPROACH_RAD: Final = np.deg2rad(40.0)
 NEAREST_OBSTACLE: Final[Situation] = {"obstacle_x_m": -0.22}
-"""What is done at the object keeps clear of the obstacle wherever it stands."""
+"""The obstacle's position nearest to the object, from which grasp and lift keep clear."""
 
 
 class PostureFitter:
-    """The residuals of each key posture, and the order in which they are fitted."""
+    """Fits the key postures one after another."""
 
     def __init__(self) -> None:
-        """Set up the arm with the hand open, and the grids of situations."""
+        """Make the model of the arm with the open hand, and the grids of situations."""
         self._arm = Arm(OPEN_DEG, TABLE_DROP_M)
         self._start = np.deg2rad(START[ARM])
         self._objects = [
@@ -79,7 +79,7 @@ class PostureFitter:
         self._obstacle_features = np.array([obstacle_features(s) for s in self._obstacles])
 
     def fit(self) -> KeyPostures:
-        """Fit all key postures; takes some seconds on one core."""
+        """Fit all key postures; takes a few seconds on one core."""
         grasp = self._fit_grasp()
         fitted = {"grasp": grasp}
         below = grasp
@@ -144,7 +144,7 @@ class PostureFitter:
         return fit_polynomial(self._object_features, residual, start, OBJECT_ORDERS)
 
     def _fit_descent(self, grasp: Array, below: Array, height_m: float) -> Array:
-        """The open hand, raised straight above its grasp, turned the same way."""
+        """Fit a posture of the open hand at a height above the grasp, in the same orientation."""
         grasps = [self._arm.pose(q) for q in self._object_features @ grasp]
         before = self._object_features @ below
         loose = 1.0 + 4.0 * height_m / DESCENT_M
@@ -174,7 +174,7 @@ class PostureFitter:
         return fit_polynomial(self._object_features, residual, below, OBJECT_ORDERS)
 
     def _fit_lift(self, grasp: Array, below: Array, height_m: float) -> Array:
-        """The grasped object raised, held level enough, free to drift sideways a little."""
+        """Fit a posture that lifts the grasped object nearly level; it may shift sideways."""
         grasps = [self._arm.pose(q) for q in self._object_features @ grasp]
         before = self._object_features @ below
 
@@ -197,7 +197,7 @@ class PostureFitter:
         return fit_polynomial(self._object_features, residual, below, OBJECT_ORDERS)
 
     def _fit_over(self, above: Array) -> Array:
-        """The hand just above the obstacle, with a clear way on to above the object."""
+        """Fit a posture of the hand just above the obstacle, from which the way on is clear."""
         middle = object_features(self._objects[len(self._objects) // 2]) @ above
         corners = [
             object_features({"object_y_m": y, "object_yaw_deg": yaw}) @ above
@@ -217,7 +217,9 @@ class PostureFitter:
             on_the_way = [
                 self._obstacle(self._arm.pose(between), situation, PASSING_MARGIN_M)
                 for corner in corners
-                for between in travel([posture, corner], np.array([0.1, 0.2, 0.35, 0.5, 0.75]))
+                for between in interpolate_postures(
+                    [posture, corner], np.array([0.1, 0.2, 0.35, 0.5, 0.75])
+                )
             ]
             lowest = float((pose.points_m[:, 2] - self._arm.radii_m)[self._arm.of_hand].min())
             return np.concatenate(
@@ -235,7 +237,7 @@ class PostureFitter:
         return fit_polynomial(self._obstacle_features, residual, start, OBSTACLE_ORDERS)
 
     def _fit_beside(self, over: Array) -> Array:
-        """The hand close beside the obstacle, on the right of it, on its way up."""
+        """Fit a posture of the hand close to the right side of the obstacle, on its way up."""
         after = self._obstacle_features @ over
 
         def residual(posture: Array, i: int) -> Array:
@@ -244,7 +246,9 @@ class PostureFitter:
             pose = self._arm.pose(posture)
             hand = pose.position_m + pose.rotation @ GRASP_CENTRE_M
             leftmost = float((pose.points_m[:, 0] - self._arm.radii_m)[self._arm.of_hand].min())
-            way = travel([self._start, posture, after[i]], np.linspace(0.05, 0.95, 19))
+            way = interpolate_postures(
+                [self._start, posture, after[i]], np.linspace(0.05, 0.95, 19)
+            )
             on_the_way = [
                 part
                 for between in way
@@ -280,7 +284,7 @@ def _obstacle_box(situation: Situation) -> ClearanceBox:
 
 
 def main() -> None:
-    """Fit all key postures and write them where `load_key_postures` finds them."""
+    """Fit all key postures and write them to the file that `load_key_postures` reads."""
     text = PostureFitter().fit().to_json()
     with as_file(FITTED) as path, written_whole(path) as stream:
         stream.write(text.encode())

@@ -1,9 +1,10 @@
-"""Reads the three readings of success in Experiment I.
+"""Judges the three readings of success in Experiment I.
 
-- lenient, the paper's: the object ends more than 5 cm above its start;
-- strict: lifted and held, the obstacle never touched, the object moved by at most 10 mm and turned
-  by at most 5 degrees before the hand closes;
-- precise: strict, and the hand's pose to the object was right when it closed.
+- lenient, the paper's criterion: at the end the object is more than 5 cm above its start;
+- strict: the object is lifted and held, the obstacle is never touched, and before the hand closes
+  the object moves by at most 10 mm and turns by at most 5 degrees;
+- precise: strict, and when the hand closes its yaw error is at most 10 degrees and its offset from
+  the object at most 20 mm along and 10 mm across the object's long axis.
 """
 
 from __future__ import annotations
@@ -50,11 +51,11 @@ class _Instant:
 
 @dataclass(frozen=True)
 class _Approach:
-    """How the hand came to the object.
+    """Hand and object at the end of the approach.
 
     Attributes:
-        moved_mm: how far the object had moved.
-        turned_deg: how far the object had turned.
+        moved_mm: horizontal distance of the object from its start.
+        turned_deg: magnitude of the object's rotation since its start.
         hand: pose of the hand relative to the object.
     """
 
@@ -64,29 +65,29 @@ class _Approach:
 
 
 class Experiment1Judge:
-    """Judges one episode from true poses and the measured hand.
+    """Judges one episode from the true poses of the bodies and the measured hand joints.
 
     Measures: `lifted_m`, height of the object above its start at the end; the attributes of
-    `_Approach` and `HandOffset` at the last step before the hand closed; `closed_at`, the step at
-    which it closed; `obstacle_touched_at`, the first step in which the obstacle was touched. A step
-    that never came is -1.
+    `_Approach` and `HandOffset` at the last step before the hand closed (at the last step if it
+    never closed); `closed_at`, the step at which the hand closed, or -1; `obstacle_touched_at`, the
+    first step in which the obstacle was touched, or -1.
     """
 
     def __init__(self, situation: Situation) -> None:
-        """Start watching an episode of `situation`."""
+        """Prepare to judge an episode in a situation."""
         self._start = object_pose(situation)
         self._instants: list[_Instant] = []
 
     def watch(self, report: StepReport, joints_deg: Array, bodies: Mapping[str, Pose]) -> None:
-        """Take note of one control step that has just been run."""
+        """Record one control step after it was simulated."""
         touched = any(box == "obstacle" for box, _ in report.touches)
         self._instants.append(_Instant(joints_deg, touched, bodies))
 
     def outcome(self) -> Outcome:
-        """How the episode went, once its last step was watched."""
+        """Judge the episode; to be called after its last step was recorded."""
         instants = self._instants
         closed_step = closed_at(instant.joints_deg for instant in instants)
-        # The last instant at which the hand was still open tells how it came to the object.
+        # The approach ends at the last instant at which the hand is open.
         before = self._approach(
             instants[max(closed_step - 1, 0)] if closed_step >= 0 else instants[-1]
         )

@@ -1,4 +1,4 @@
-"""The tutor's plan for a situation: the whole behaviour of Experiment I, step by step."""
+"""Plans the tutor's actions in a situation of Experiment I."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from actors.attention import clip_action
 from actors.kinematics import Gaze
-from actors.motion import minimum_jerk, ramp, travel
+from actors.motion import interpolate_postures, minimum_jerk, ramp
 from actors.tasks.experiment1.postures import KeyPostures, load_key_postures
 from actors.tasks.experiment1.world import (
     START,
@@ -25,17 +25,17 @@ from proto.variables import Situation
 Array = NDArray[np.float64]
 
 GAZE_STEPS: Final = 6
-"""A turn of the head takes this many control steps, then it rests."""
+"""Control steps of a head movement."""
 FOCUS_STEPS: Final = 8
 CLOSING_STEPS: Final = 9
 LIFTING_STEPS: Final = 14
-"""The last steps of the lift hold the object still."""
+"""Control steps of the lifting movement; in the rest of the subtask the object is held still."""
 OBSTACLE_GAZE_M: Final = np.array([0.0, -0.05, 0.06])
-"""Where on the obstacle the robot looks, from its centre: the upper edge near the hand."""
+"""Gaze target relative to the obstacle's centre: the upper edge near the hand."""
 
 
 def plan(situation: Situation) -> Array:
-    """Actions (T, 11) that carry out Experiment I in a situation (see `proto.body`)."""
+    """Return the tutor's actions (T, 11) in a situation (see `proto.body`)."""
     steps = dict(zip(SUBTASKS, np.cumsum([0, *SUBTASKS.values()]), strict=False))
     total = sum(SUBTASKS.values())
     actions = np.tile(START, (total, 1))
@@ -44,7 +44,7 @@ def plan(situation: Situation) -> Array:
     closing = ramp(total, steps["grasp"], CLOSING_STEPS)
     actions[:, GRASP] = 1.0 + 9.0 * closing
     actions[:, FOCUS] = 1.0 + 19.0 * ramp(total, steps["descend"], FOCUS_STEPS)
-    return clip_action(actions)  # between key postures a joint may pass its limit by a degree
+    return clip_action(actions)  # between key postures a joint can exceed its limit by a degree
 
 
 @cache
@@ -53,7 +53,7 @@ def _gaze() -> Gaze:
 
 
 def _neck(situation: Situation, steps: dict[str, int]) -> Array:
-    """Neck pitch and yaw (T, 2): the task space, then the obstacle, then the object."""
+    """Return neck pitch and yaw (T, 2): gaze at the task space, the obstacle, then the object."""
     total = sum(SUBTASKS.values())
     at_obstacle = _gaze().neck_deg(np.array(obstacle_pose(situation).position_m) + OBSTACLE_GAZE_M)
     at_object = _gaze().neck_deg(np.array(object_pose(situation).position_m))
@@ -65,14 +65,14 @@ def _neck(situation: Situation, steps: dict[str, int]) -> Array:
 
 
 def _arm(situation: Situation, postures: KeyPostures) -> Array:
-    """Arm postures (T, 7): each subtask moves through its key postures or rests."""
+    """Return the arm postures (T, 7): in each subtask the arm follows key postures or rests."""
 
     def posture(name: str) -> Array:
         return postures.start if name == "start" else postures.arm_deg(name, situation)
 
     def through(*names: str, moving: int, total: int) -> Array:
-        share = minimum_jerk(np.arange(1, total + 1) / moving)
-        return travel([posture(name) for name in names], share)
+        fraction = minimum_jerk(np.arange(1, total + 1) / moving)
+        return interpolate_postures([posture(name) for name in names], fraction)
 
     n = SUBTASKS
     across, reach, descend = n["move over obstacle"], n["reach above object"], n["descend"]

@@ -1,7 +1,7 @@
-"""Reaching and grasping without an obstacle, for pre-training of the vision (paper, section 4.1).
+"""The task `reaching`: Experiment I without its obstacle, for pre-training (paper, section 4.1).
 
-Everything is as in Experiment I, but nothing stands in the way. The tutor moves as it would over
-the middle obstacle, so that sequences differ only in where the object is and how it lies.
+The tutor moves as over the obstacle in its middle position, so that sequences differ only in the
+position and yaw of the object.
 """
 
 from __future__ import annotations
@@ -21,5 +21,5 @@ class Reaching(Experiment1):
     variables = tuple(each for each in Experiment1.variables if each.name != "obstacle_x_m")
 
     def plan(self, situation: Situation) -> Array:
-        """The tutor's actions (124, 11), as over the middle obstacle."""
+        """Return the tutor's actions (124, 11), those for the obstacle in its middle position."""
         return plan({**situation, "obstacle_x_m": MIDDLE["obstacle_x_m"]})

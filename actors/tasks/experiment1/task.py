@@ -21,7 +21,11 @@ def _variable(name: str, values: Sequence[float]) -> Continuous:
 
 
 class Experiment1(Task):
-    """Experiment I with its obstacle; trials are uniform inside what the tutored values span."""
+    """Experiment I. The tutored situations are a grid; random situations are uniform in its ranges.
+
+    Attributes:
+        grid: the tutored values of each variable.
+    """
 
     name = "experiment1"
     grid: ClassVar[Mapping[str, tuple[float, ...]]] = world.GRID
@@ -33,19 +37,19 @@ class Experiment1(Task):
     figure_words = FIGURE_WORDS
 
     def tutored(self) -> Sequence[Situation]:
-        """The cases of the grid; the paper's 45."""
+        """Return all situations of the grid, 45 in Experiment I."""
         return [
             dict(zip(self.grid, values, strict=True)) for values in product(*self.grid.values())
         ]
 
     def scene(self, situation: Situation) -> Scene:
-        """Table, obstacle and object."""
+        """Return the scene with table, obstacle and object."""
         return world.scene(situation)
 
     def plan(self, situation: Situation) -> Array:
-        """The tutor's actions (124, 11)."""
+        """Return the tutor's actions (124, 11)."""
         return plan(situation)
 
     def judge(self, situation: Situation) -> Experiment1Judge:
-        """A judge for one episode of a situation."""
+        """Return a judge for one episode in a situation."""
         return Experiment1Judge(situation)

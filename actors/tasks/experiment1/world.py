@@ -1,4 +1,4 @@
-"""The world of Experiment I: table, obstacle, object, and how long each subtask takes.
+"""The world of Experiment I: table, obstacle, object, and duration of the subtasks.
 
 Task frame of the paper: X lateral (negative is the robot's right), Y forward, Z up, left-handed.
 """
@@ -22,12 +22,12 @@ GRID: Final[Mapping[str, tuple[float, ...]]] = {
     "object_y_m": OBJECT_Y_M,
     "object_yaw_deg": OBJECT_YAW_DEG,
 }
-"""The tutored values of each variable, 3 x 3 x 5 as in the paper; the ranges are what they span."""
+"""Tutored values of each variable, 3 x 3 x 5 as in the paper; they span the variable's range."""
 MIDDLE: Final[Situation] = {"obstacle_x_m": -0.27, "object_y_m": 0.25, "object_yaw_deg": 0.0}
 """The situation in the middle of the ranges."""
 
-# Sizes are the paper's. The object's X, the obstacle's Y and the height of the table it leaves
-# open; here they are where the arm reaches every corner of the ranges.
+# The sizes are those of the paper. The paper does not give the object's X, the obstacle's Y and the
+# height of the table; these values let the arm reach all corners of the ranges.
 OBJECT_SIZE_M: Final = (0.028, 0.10, 0.07)
 OBJECT_X_M: Final = -0.04
 OBJECT_MASS_KG: Final = 0.1
@@ -48,14 +48,14 @@ SUBTASKS: Final[Mapping[str, int]] = {
     "grasp": 14,
     "lift": 20,
 }
-"""The eight subtasks of the paper and the control steps that each takes."""
+"""The eight subtasks of the paper and their control steps."""
 
 START: Final = np.array([-32.0, -23.0, -3.0, 54.0, -22.0, 18.0, -32.0, -9.0, 10.0, 1.0, 1.0])
-"""Posture and levels that every episode starts from (see `proto.body`)."""
+"""Posture and levels at the start of every episode (see `proto.body`)."""
 
 
 def object_pose(situation: Situation) -> Pose:
-    """Where the object starts, in the world frame."""
+    """Return the pose of the object at the start, in the world frame."""
     half_turn = np.deg2rad(-number_of(situation, "object_yaw_deg")) / 2
     return Pose(
         (-OBJECT_X_M, number_of(situation, "object_y_m"), OBJECT_SIZE_M[2] / 2),
@@ -64,12 +64,12 @@ def object_pose(situation: Situation) -> Pose:
 
 
 def obstacle_pose(situation: Situation) -> Pose:
-    """Where the obstacle stands, in the world frame."""
+    """Return the pose of the obstacle, in the world frame."""
     return Pose((-number_of(situation, "obstacle_x_m"), OBSTACLE_Y_M, OBSTACLE_SIZE_M[2] / 2))
 
 
 def scene(situation: Situation) -> Scene:
-    """Table, object, and the obstacle where the situation has one."""
+    """Return the scene: table, object, and the obstacle if the situation has one."""
     return Scene(
         boxes=(_table(), *_obstacles(situation), _object(situation)),
         start=targets_of_action(START),

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.kinematics import Arm, ArmPose, ClearanceBox
-from actors.motion import travel
+from actors.motion import interpolate_postures
 from actors.posture_fitting import (
     ANGLE,
     LIMIT,
@@ -178,8 +178,8 @@ class FamilyFitter:
             axis = pose.rotation @ GRASP_AXIS
             return np.concatenate(
                 [
-                    [offset @ across / POSITION, offset @ along / (2.5 * POSITION)],
-                    [offset[2] / (3 * POSITION)],
+                    [offset @ across / POSITION, offset @ along / (3 * POSITION)],
+                    [offset[2] / (2 * POSITION)],
                     [axis @ along / ANGLE, axis[2] / (4 * ANGLE), self._tilt(pose)],
                     self._clear(pose, box),
                     self._limits(posture),
@@ -252,7 +252,7 @@ class FamilyFitter:
         def residual(posture: Array, i: int) -> Array:
             box = self._boxes[corners[i]]
             parts = []
-            for between in travel([self._start, posture, ends[i]], shares):
+            for between in interpolate_postures([self._start, posture, ends[i]], shares):
                 pose = self._arm.pose(between)
                 parts += [
                     shortfall(self._distances(pose, box).min(), PASSING_MARGIN_M),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from actors.attention import clip_action
 from actors.kinematics import Gaze
-from actors.motion import minimum_jerk, ramp, travel
+from actors.motion import interpolate_postures, minimum_jerk, ramp
 from actors.tasks.experiment2.postures import FamilyPostures, load_key_postures
 from actors.tasks.experiment2.setting import PlacedObject, Setting
 from actors.tasks.experiment2.world import START, SUBTASKS, TABLE_DROP_M
@@ -69,7 +69,7 @@ def _arm(target: PlacedObject, postures: FamilyPostures) -> Array:
 
     def through(*names: str, moving: int, total: int) -> Array:
         share = minimum_jerk(np.arange(1, total + 1) / moving)
-        return travel([posture(name) for name in names], share)
+        return interpolate_postures([posture(name) for name in names], share)
 
     n = SUBTASKS
     waiting = sum(n[name] for name in list(n)[:4])

@@ -147,3 +147,10 @@ def test_without_continuous_values_nothing_is_mixed() -> None:
     mixtures = grid.mixtures(torch.arange(3), 1.0, torch.Generator().manual_seed(1))
     assert mixtures.members.tolist() == [[0], [1], [2]]
     assert mixtures.weights.tolist() == [[1.0], [1.0], [1.0]]
+
+
+def test_situations_with_other_values_are_never_neighbours() -> None:
+    grid = NeighbourGrid([*GRID, {"side": 0.2}, {"side": 0.25}, {"y": 0.2}], [10] * 12)
+    assert corners(grid, 0) == {(0, 1, 3, 4)}
+    assert corners(grid, 9) == {(9, 9, 10, 10)}, "flat along the value that it does not have"
+    assert corners(grid, 11) == {(11, 11, 11, 11)}

@@ -135,7 +135,7 @@ def test_a_policy_that_is_not_there_is_named(workers: int) -> None:
     ("words", "message"),
     [
         ("--policy nobody --trials 1", "no such policy"),
-        ("--policy tutor --backend nothing", "no backend 'nothing'"),
+        ("--policy tutor --backend nothing", "there is no 'nothing'"),
         ("--policy tutor --task experiment9", "task.name"),
         ("--policy tutor --set tutor.speed=3", "tutor.speed"),
         ("--policy tutor --situation object_y_m", "write NAME=VALUE"),

@@ -81,7 +81,7 @@ def test_a_right_grasp_is_precise():
 
 
 @pytest.mark.parametrize(
-    "hand", [{"hand_yaw": 12.0}, {"hand_yaw": -12.0}, {"along": 0.017}, {"across": -0.012}]
+    "hand", [{"hand_yaw": 9.0}, {"hand_yaw": -9.0}, {"along": 0.017}, {"across": -0.012}]
 )
 def test_a_hand_placed_wrong_is_strict_but_imprecise(hand):
     outcome = judged(bodies(**hand))
