@@ -79,7 +79,7 @@ def parser_of(command: str) -> argparse.ArgumentParser:
     return parser
 
 
-@pytest.mark.parametrize("document", (*DOCUMENTS, CHANGELOG), ids=lambda document: document.stem)
+@pytest.mark.parametrize("document", [*DOCUMENTS, CHANGELOG], ids=lambda document: document.stem)
 def test_every_relative_link_leads_somewhere(document: Path) -> None:
     broken = []
     for link in re.findall(r"\]\(([^)\s]+)\)", document.read_text()):
