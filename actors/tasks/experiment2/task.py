@@ -69,6 +69,7 @@ class Experiment2(Task):
         Question("indicated_y_m", 3, window=_window(74, 128)),
         Question("indicated_yaw_deg", 3, window=_window(74, 128)),
     )
+    distractors = frozenset({"other_y_m", "other_yaw_deg", SUBJECT, TAKE})
     baselines = BASELINES
     figure_words = FIGURE_WORDS
     options = OPTIONS
