@@ -64,10 +64,16 @@ def is_importable(name: str) -> bool:
     return True
 
 
+def code(text: str) -> str:
+    """The code blocks: those between fences, and lines that are indented by four spaces."""
+    fenced = re.findall(r"^```\w*\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+    return "\n".join([*fenced, *re.findall(r"^    .*$", text, flags=re.MULTILINE)])
+
+
 def commands(text: str) -> Iterator[list[str]]:
     """The words of each `vmdnn` command in the code blocks; what the shell fills in stands as X."""
-    text = re.sub(r"\\\n\s*", "", text)
-    for line in re.findall(r"^ *(?:[A-Z_]+=\S+ )?(vmdnn .*)$", text, flags=re.MULTILINE):
+    lines = re.sub(r"\\\n\s*", "", code(text))
+    for line in re.findall(r"^ *(?:[A-Z_]+=\S+ )?(vmdnn .*)$", lines, flags=re.MULTILINE):
         filled = re.sub(r"\$\([^)]*\)", "X", line)
         yield shlex.split(filled, comments=True)[1:]
 
