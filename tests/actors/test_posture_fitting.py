@@ -1,4 +1,4 @@
-"""Fitting polynomials of the situation to residuals of postures."""
+"""Fitting of postures that are polynomials of the situation."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_linearize_gives_values_jacobians_and_their_cost():
     assert cost == pytest.approx(2 * (4.0 + 9.0 + 16.0))
 
 
-def test_shortfall_counts_only_what_misses_the_margin():
+def test_shortfall_is_zero_beyond_the_margin():
     np.testing.assert_allclose(
         shortfall(np.array([0.010, 0.004, -0.002]), 0.006),
         np.array([0.0, 0.002, 0.008]) / CLEARANCE,

@@ -1,4 +1,4 @@
-"""Sequences that a small training can learn: a bar is seen, and tells where to go."""
+"""Sequences for a small training: the position of a bar in the picture determines the action."""
 
 from __future__ import annotations
 
