@@ -247,7 +247,8 @@ def train(
     from proto.config import Config as Default  # noqa: PLC0415
 
     config, folder = config or Default(), Path(out)
-    recipe = VMDNNRecipe(config, make(config.task).questions)
+    task = make(config.task)
+    recipe = VMDNNRecipe(config, task.questions, task.distractors)
     trainer = open_training(recipe, folder, TutoringStore(Path(data)))
 
     def go_on(loss: float) -> bool:

@@ -21,7 +21,7 @@ from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
-from services.arguments.common import integer
+from services.arguments.common import config_argument, integer
 from services.board import Board, RunView
 from services.machine.ports import port_trouble
 from services.terminal.display import display
@@ -247,7 +247,7 @@ def _span(times_s: Sequence[int]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="run_local", add_help=False)  # run_local.sh prints it
-    parser.add_argument("--config", type=Path, default=DEFAULT_CONFIG)
+    parser.add_argument("--config", type=config_argument, default=DEFAULT_CONFIG)
     parser.add_argument("--actors", type=integer(0))
     parser.add_argument("--backend")
     parser.add_argument("--set", dest="overrides", action="append", default=[])

@@ -11,8 +11,8 @@ graphics driver), then starts hub, learner, evaluator, recorder and actors. Proc
 are started again. Shows their state until the config's `done` is reached or Ctrl-C is pressed, then
 stops all processes and prints a summary. The same command continues a run that was stopped.
 
-  --config FILE     config of the run (default: deploy/config/experiment1.yaml);
-                    deploy/config/smoke.yaml takes a few minutes
+  --config FILE     a file, or the name of a configuration in deploy/config (default:
+                    experiment1); smoke takes a few minutes
   --actors N        number of actors (default: one for each core)
   --backend NAME    the simulator: a built-in one, or your own as package.module:Class
   --set KEY=VALUE   override a value of the config, such as learner.rate=1e-3; may be repeated

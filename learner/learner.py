@@ -100,7 +100,11 @@ class Learner:
         self._stores = _stores(config)
         self._materials = self._make_materials()
         self._trainer = open_training(
-            VMDNNRecipe(config, tasks[config.pretraining_task or config.task.name].questions),
+            VMDNNRecipe(
+                config,
+                tasks[config.pretraining_task or config.task.name].questions,
+                tasks[config.task.name].distractors,
+            ),
             self._folder,
             self._materials[Stage.COUPLED].store,
             self._materials[Stage.PRETRAINING].store,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import yaml
 from pydantic import (
@@ -76,6 +77,16 @@ class _Section(BaseModel):
             else value
             for name, value in values.items()
         }
+
+
+LOG = logging.getLogger(__name__)
+
+_RETIRED_KEYS: Final = (
+    "network.image",
+    "learner.pretraining.labels",
+    "learner.pretraining.answer_part",
+)
+"""Keys that had an effect once: the size of images is fixed, and the task asks the questions."""
 
 
 class RunConfig(_Section):
@@ -499,7 +510,19 @@ def _read(path: Path) -> dict[str, Any]:
         return {}
     if not isinstance(values, dict):
         raise UserError(f"config file {path}: expected `section: ...` lines at the top level")
+    _drop_retired_keys(values, path)
     return values
+
+
+def _drop_retired_keys(values: dict[str, Any], path: Path) -> None:
+    """Drop keys that runs of vmdnn 0.1 saved in their configuration, and say so in the log."""
+    for key in _RETIRED_KEYS:
+        *sections, last = key.split(".")
+        section: Any = values
+        for name in sections:
+            section = section.get(name) if isinstance(section, dict) else None
+        if isinstance(section, dict) and section.pop(last, None) is not None:
+            LOG.warning("%s: %s has no effect any more and is ignored", path, key)
 
 
 def _key_of(problem: ErrorDetails) -> str:

@@ -100,6 +100,8 @@ class Task(ABC):
         start: (11,) the action whose posture every episode starts from (see `proto.body`).
         questions: the questions about the variables that pre-training learns to answer; empty if
             the task cannot be used for pre-training.
+        distractors: names of variables that the tutor's actions do not depend on. Sequences that
+            differ in them may be mixed (see `learner.training.interpolation`).
         baselines: by name, the situation that a baseline assumes. A baseline executes the tutor's
             plan for this situation.
         figure_words: labels and errors for figures.
@@ -114,6 +116,7 @@ class Task(ABC):
     subtasks: Mapping[str, int]
     start: Array
     questions: tuple[Question, ...] = ()
+    distractors: frozenset[str] = frozenset()
     baselines: ClassVar[Mapping[str, Belief]] = {}
     figure_words: ClassVar[FigureWords] = FigureWords({})
     options: ClassVar[frozenset[str]] = frozenset()

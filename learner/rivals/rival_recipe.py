@@ -7,7 +7,7 @@ vision, without a classifier of situations.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from torch import Tensor
@@ -79,10 +79,15 @@ class RivalCoupledTraining(CoupledObjective):
     """
 
     def __init__(
-        self, network: Rival, code: SoftmaxCode, config: LearnerConfig, generator: torch.Generator
+        self,
+        network: Rival,
+        code: SoftmaxCode,
+        config: LearnerConfig,
+        generator: torch.Generator,
+        distractors: Collection[str] = (),
     ) -> None:
         """Start without sequences; `generator` draws mixtures and vision noise."""
-        super().__init__(network.see, code, generator)
+        super().__init__(network.see, code, generator, distractors)
         self.parameters = network.coupled_parameters()
         self._network = network
         self._config = config
@@ -107,9 +112,10 @@ class RivalRecipe:
     publish_every_epochs = None
     pretraining_variables: Sequence[str] = ()
 
-    def __init__(self, config: Config, kind: RivalKind) -> None:
-        """Make a network with random weights."""
+    def __init__(self, config: Config, kind: RivalKind, distractors: Collection[str] = ()) -> None:
+        """Make a network with random weights; for the distractors see `NeighbourGrid`."""
         self.config = config
+        self._distractors = distractors
         self.generator = torch.Generator().manual_seed(config.run.seed)
         self._settings = rival_config(config.comparison, kind)
         units = self._settings.units
@@ -156,11 +162,18 @@ class RivalRecipe:
     ) -> EndToEndTraining | RivalCoupledTraining:
         if stage is Stage.PRETRAINING:
             return EndToEndTraining(self.network, code, self._settings, self.generator)
-        return RivalCoupledTraining(self.network, code, self.config.learner, self.generator)
+        return RivalCoupledTraining(
+            self.network, code, self.config.learner, self.generator, self._distractors
+        )
 
 
 def make_recipe(
-    config: Config, rival: RivalKind | None, questions: Sequence[Question] = ()
+    config: Config,
+    rival: RivalKind | None,
+    questions: Sequence[Question] = (),
+    distractors: Collection[str] = (),
 ) -> Recipe:
     """The recipe of a rival, or of VMDNN if `rival` is None; only that asks questions."""
-    return VMDNNRecipe(config, questions) if rival is None else RivalRecipe(config, rival)
+    if rival is None:
+        return VMDNNRecipe(config, questions, distractors)
+    return RivalRecipe(config, rival, distractors)

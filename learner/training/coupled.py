@@ -7,7 +7,7 @@ sequence, when the sequence is added.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,7 +61,11 @@ class CoupledObjective:
     classifier = None
 
     def __init__(
-        self, see: Callable[[Tensor], Tensor], code: SoftmaxCode, generator: torch.Generator
+        self,
+        see: Callable[[Tensor], Tensor],
+        code: SoftmaxCode,
+        generator: torch.Generator,
+        distractors: Collection[str] = (),
     ) -> None:
         """Start without sequences.
 
@@ -69,7 +73,9 @@ class CoupledObjective:
             see: V_S (B, T, units) for images (B, T, height, width).
             code: how the outputs code actions.
             generator: draws noise and mixtures.
+            distractors: variables that the actions do not depend on, see `NeighbourGrid`.
         """
+        self._distractors = distractors
         self.code = code
         self._see = see
         self._generator = generator
@@ -123,7 +129,7 @@ class CoupledObjective:
                 sequences,
                 deviations=sequences.seen.std((0, 1)),
                 targets=pad_sequence(list(map(torch.from_numpy, self._targets)), True),
-                grid=NeighbourGrid(self._situations, list(map(len, self._seen))),
+                grid=NeighbourGrid(self._situations, list(map(len, self._seen)), self._distractors),
             )
         return self._stacked
 
@@ -148,7 +154,12 @@ class CoupledTraining(CoupledObjective):
     """
 
     def __init__(
-        self, network: VMDNN, code: SoftmaxCode, config: LearnerConfig, generator: torch.Generator
+        self,
+        network: VMDNN,
+        code: SoftmaxCode,
+        config: LearnerConfig,
+        generator: torch.Generator,
+        distractors: Collection[str] = (),
     ) -> None:
         """Start without sequences.
 
@@ -157,8 +168,9 @@ class CoupledTraining(CoupledObjective):
             code: how the outputs code actions.
             config: amplitude of the vision noise, and how often sequences are mixed.
             generator: draws both.
+            distractors: variables that the actions do not depend on, see `NeighbourGrid`.
         """
-        super().__init__(network.see, code, generator)
+        super().__init__(network.see, code, generator, distractors)
         self.parameters = network.coupled_parameters()
         self._network = network
         self._config = config

@@ -10,7 +10,7 @@ close to what the tutor would show inside the cell (mixup, Zhang et al. 2018, wi
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from math import prod
@@ -55,18 +55,29 @@ class NeighbourGrid:
     A dimension of the grid is a continuous value of the situation. Two situations are neighbours if
     they differ in one continuous value only and no other situation lies between them. A value that
     is text is a discrete choice: sequences are mixed only if their discrete values agree, and their
-    lengths. A situation without neighbours is never mixed.
+    lengths. A situation without neighbours is never mixed. Distractors, on which the actions do not
+    depend, count for nothing here: situations that differ in them alone lie at the same point.
     """
 
-    def __init__(self, situations: Sequence[Situation], steps: Sequence[int]) -> None:
+    def __init__(
+        self,
+        situations: Sequence[Situation],
+        steps: Sequence[int],
+        distractors: Collection[str] = (),
+    ) -> None:
         """Find the cells.
 
         Args:
             situations: situation of each sequence; those with other names are never neighbours.
             steps: number of steps of each sequence.
+            distractors: names of values that the actions do not depend on.
         """
+        relevant = [
+            {name: value for name, value in situation.items() if name not in distractors}
+            for situation in situations
+        ]
         self._points = [
-            _point(situation, length) for situation, length in zip(situations, steps, strict=True)
+            _point(situation, length) for situation, length in zip(relevant, steps, strict=True)
         ]
         self._sequences_at: dict[_Point, list[int]] = defaultdict(list)
         for index, point in enumerate(self._points):

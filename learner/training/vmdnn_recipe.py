@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import torch
@@ -26,12 +26,15 @@ class VMDNNRecipe:
 
     rival = None
 
-    def __init__(self, config: Config, questions: Sequence[Question]) -> None:
+    def __init__(
+        self, config: Config, questions: Sequence[Question], distractors: Collection[str] = ()
+    ) -> None:
         """Make a network with random weights.
 
         Args:
             config: everything the training depends on.
             questions: what pre-training asks about the situations of its task.
+            distractors: variables that the actions do not depend on, see `NeighbourGrid`.
 
         Raises:
             UserError: pre-training has nothing to ask.
@@ -43,6 +46,7 @@ class VMDNNRecipe:
             )
         self.config = config
         self._questions = tuple(questions)
+        self._distractors = distractors
         self.generator = torch.Generator().manual_seed(config.run.seed)
         self.network = VMDNN(config.network)
         self.network.initialize(
@@ -109,7 +113,9 @@ class VMDNNRecipe:
         return Pretraining(self.network, asked, config, self.generator)
 
     def _coupled_training(self, code: SoftmaxCode) -> CoupledTraining:
-        return CoupledTraining(self.network, code, self.config.learner, self.generator)
+        return CoupledTraining(
+            self.network, code, self.config.learner, self.generator, self._distractors
+        )
 
 
 def code_of(episodes: Sequence[Episode], config: Config) -> SoftmaxCode:

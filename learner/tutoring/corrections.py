@@ -21,9 +21,11 @@ class Situations(Protocol):
 
     Attributes:
         questions: what pre-training asks about its situations.
+        distractors: variables that the tutor's actions do not depend on.
     """
 
     questions: tuple[Question, ...]
+    distractors: frozenset[str]
 
     def tutored(self) -> Sequence[Situation]:
         """The tutored situations, always in the same order."""

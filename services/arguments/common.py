@@ -21,7 +21,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     """Add --config and --set."""
     parser.add_argument(
         "--config",
-        type=_config_argument,
+        type=config_argument,
         metavar="FILE|NAME",
         help="YAML file, or a built-in configuration: experiment1, paper, smoke; without it, all"
         " defaults",
@@ -72,7 +72,8 @@ def config_file(name: str) -> Path:
     return built_in[name]
 
 
-def _config_argument(name: str) -> Path:
+def config_argument(name: str) -> Path:
+    """`config_file`, for `type=` of an argument."""
     try:
         return config_file(name)
     except UserError as error:

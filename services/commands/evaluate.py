@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
         title = "{policy} on {task} in {backend}, {trials} trials, {wall_s:.1f} s".format(**result)
         Console().print(success_table(title, tally))
     if arguments.video is not None and first is not None:
-        write_video(first, arguments.video, config.simulator)
+        write_video(first, arguments.video, config)
     return 0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from proto.config import SimulatorConfig
 from proto.recordings.episodes import read_episode
+from services.arguments.common import add_config, config_of
 from services.playing.video import write_video
 from services.terminal.progress import progress_bar
 
@@ -19,12 +20,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--backend", help="simulator that renders; without it, the one that played the episode"
     )
+    add_config(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Render the episode as a video."""
     episode = read_episode(arguments.file, partial=True)
-    config = SimulatorConfig(backend=arguments.backend or episode.backend)
+    simulator = SimulatorConfig(backend=arguments.backend or episode.backend)
+    config = config_of(arguments).model_copy(update={"simulator": simulator})
     with progress_bar("rendering", episode.steps) as advance:
         write_video(episode, arguments.out, config, fps=arguments.fps, on_frame=advance)
     print(f"{arguments.out}: {episode.steps} frames")

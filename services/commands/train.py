@@ -42,8 +42,10 @@ def run(arguments: argparse.Namespace) -> int:
     config = config_of(arguments)
     store, others = training_stores(arguments)
     folder: Path = arguments.out
-    task = make_task(config.task) if others is None else make_pretraining_task(config)
-    trainer = open_training(VMDNNRecipe(config, task.questions), folder, store, others)
+    task = make_task(config.task)
+    pretraining_task = task if others is None else make_pretraining_task(config)
+    recipe = VMDNNRecipe(config, pretraining_task.questions, task.distractors)
+    trainer = open_training(recipe, folder, store, others)
     config.save(folder / "config.yaml")
     if trainer.finished:
         print(

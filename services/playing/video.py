@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
+from textwrap import wrap
 from typing import Final
 
 import cv2
@@ -15,9 +16,10 @@ from numpy.typing import NDArray
 
 from actors.attention import crop_of_focus
 from actors.simulator import EYE_HEIGHT, EYE_WIDTH, Crop, Pose, Simulator, make_simulator
+from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from proto.body import FOCUS
-from proto.config import SimulatorConfig, TaskConfig
+from proto.config import Config
 from proto.episode import NO_FAILURE, Episode, Outcome
 from proto.errors import UserError
 from proto.storage import written_whole
@@ -30,6 +32,8 @@ PANEL_HEIGHT: Final = 480
 VIDEO_WIDTH: Final = 2 * PANEL_WIDTH
 VIDEO_HEIGHT: Final = PANEL_HEIGHT
 _LINE: Final = 24
+_LINE_LETTERS: Final = 78
+"""So many letters of the caption fit beside each other."""
 _MARGIN: Final = 12
 _WHITE: Final = (255, 255, 255)
 
@@ -37,7 +41,7 @@ _WHITE: Final = (255, 255, 255)
 def write_video(
     episode: Episode,
     out: Path,
-    config: SimulatorConfig,
+    config: Config,
     *,
     fps: float | None = None,
     on_frame: Callable[[], None] = lambda: None,
@@ -49,26 +53,26 @@ def write_video(
     Args:
         episode: the recorded episode.
         out: the file to write; it appears under its name only when it is complete.
-        config: the simulator that renders.
+        config: the simulator that renders, and options of the task.
         fps: frames per second, one frame for each control step; None for real time.
         on_frame: called after each frame.
 
     Raises:
-        UserError: the simulator cannot render, or the file cannot be written.
+        UserError: the simulator cannot render, the scene needs an option of the task, or the file
+            cannot be written.
     """
     rate = fps or 1.0 / episode.control_period_s
     with (
-        closing(make_simulator(config.model_copy(update={"render": True}))) as simulator,
+        closing(make_simulator(config.simulator.model_copy(update={"render": True}))) as simulator,
         _video_file(out, rate) as write,
     ):
-        for frame in frames(episode, simulator):
+        for frame in frames(episode, simulator, make_task(config.task_called(episode.task))):
             write(frame)
             on_frame()
 
 
-def frames(episode: Episode, simulator: Simulator) -> Iterator[Picture]:
-    """Yield one picture (480, 1280, 3) uint8, RGB, for each step of the episode."""
-    task = make_task(TaskConfig.model_validate({"name": episode.task}))
+def frames(episode: Episode, simulator: Simulator, task: Task) -> Iterator[Picture]:
+    """Yield one picture (480, 1280, 3) uint8, RGB, for each step of an episode of a task."""
     scene = task.scene(episode.situation)
     simulator.reset(scene)
     boxes = {box.name for box in scene.boxes}
@@ -122,7 +126,7 @@ def _caption(episode: Episode, step: int) -> list[str]:
         policy += f" version {episode.policy_version}"
     return [
         f"{episode.task} in {episode.backend}, {episode.kind} by {policy}",
-        situation_text(episode.situation),
+        *wrap(situation_text(episode.situation), _LINE_LETTERS),
         f"step {step + 1} of {episode.steps}, {episode.phase_names[episode.phases[step]]}, "
         f"outcome: {_in_words(episode.outcome)}",
     ]

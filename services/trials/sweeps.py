@@ -16,7 +16,7 @@ from typing import Self
 
 from pydantic import ValidationError
 
-from actors.tasks.registry import make_pretraining_task
+from actors.tasks.registry import make_pretraining_task, make_task
 from learner.checkpoint import load_checkpoint, policy_file, training_file
 from learner.rivals.rival_recipe import make_recipe
 from learner.training.recipe import Recipe
@@ -88,7 +88,8 @@ class SweepRun:
     def recipe(self) -> Recipe:
         """The network with random weights, and how it is trained."""
         questions = make_pretraining_task(self.config).questions
-        return make_recipe(self.config, self.variant.rival, questions)
+        distractors = make_task(self.config.task).distractors
+        return make_recipe(self.config, self.variant.rival, questions, distractors)
 
 
 @dataclass(frozen=True)

@@ -152,3 +152,15 @@ def test_an_invalid_seed_is_refused(
         main([*command, f"{option}={seed}"])
     assert ended.value.code == 2
     assert "is not an integer from 0 to 4294967295" in capsys.readouterr().err
+
+
+def test_keys_that_earlier_versions_saved_are_ignored_and_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text = (
+        "network: {image: [64, 48]}\nlearner: {epochs: 7, pretraining: {labels: {object_y_m: 3}}}"
+    )
+    config = load_config(written(tmp_path, text))
+    assert config.learner.epochs == 7
+    assert "network.image has no effect any more" in caplog.text
+    assert "learner.pretraining.labels has no effect any more" in caplog.text

@@ -34,6 +34,7 @@ SETTINGS = {
     "tutor.repeats": 2,
     "learner.cases": list(CASES),
     "learner.start_sequences": 4,
+    "learner.pretraining.task": "reaching",
     "learner.pretraining.cases": list(PRETRAINING_CASES),
     "learner.pretraining.repeats": 2,
     "learner.pretraining.epochs": 2,

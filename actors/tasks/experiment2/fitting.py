@@ -178,8 +178,8 @@ class FamilyFitter:
             axis = pose.rotation @ GRASP_AXIS
             return np.concatenate(
                 [
-                    [offset @ across / POSITION, offset @ along / (2.5 * POSITION)],
-                    [offset[2] / (3 * POSITION)],
+                    [offset @ across / POSITION, offset @ along / (3 * POSITION)],
+                    [offset[2] / (2 * POSITION)],
                     [axis @ along / ANGLE, axis[2] / (4 * ANGLE), self._tilt(pose)],
                     self._clear(pose, box),
                     self._limits(posture),

@@ -35,7 +35,7 @@ HELD_STEPS: Final = 5
 MOVED_MM: Final = 10.0
 TOPPLED_DEG: Final = 15.0
 OTHER_MOVED_MM: Final = 5.0
-YAW_ERROR_DEG: Final = 10.0
+YAW_ERROR_DEG: Final = 8.0
 ALONG_MM: Final = 15.0
 ACROSS_MM: Final = 10.0
 

@@ -37,7 +37,9 @@ from proto.variables import (
 )
 
 TUTORED_POSES: Final = tuple(
-    (y_m, yaw_deg) for y_m in (0.26, *world.Y_RANGE_M) for yaw_deg in (0.0, *world.YAW_RANGE_DEG)
+    (y_m, yaw_deg)
+    for y_m in (sum(world.Y_RANGE_M) / 2, *world.Y_RANGE_M)
+    for yaw_deg in (0.0, *world.YAW_RANGE_DEG)
 )
 """Y and yaw of tutored objects, the middle of the ranges first."""
 _CLIP_SEED: Final = 17
@@ -67,6 +69,7 @@ class Experiment2(Task):
         Question("indicated_y_m", 3, window=_window(74, 128)),
         Question("indicated_yaw_deg", 3, window=_window(74, 128)),
     )
+    distractors = frozenset({"other_y_m", "other_yaw_deg", SUBJECT, TAKE})
     baselines = BASELINES
     figure_words = FIGURE_WORDS
     options = OPTIONS
@@ -119,7 +122,10 @@ class Experiment2(Task):
         try:
             clip = self._clips.library.clip(setting.side, setting.subject, setting.take)
         except ValueError as error:
-            raise UserError(f"{self.name}: there is no such clip: {error}") from error
+            raise UserError(
+                f"{self.name}: there is no such clip: {error}. Videos of your own are found with"
+                f" --set task.name={self.name} --set task.gestures=FOLDER."
+            ) from error
         return world.scene(setting, clip)
 
     def plan(self, situation: Situation) -> Array:

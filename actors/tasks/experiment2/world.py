@@ -27,10 +27,14 @@ SUBTASKS: Final[Mapping[str, int]] = {
 START: Final = np.array([26.4, -1.8, -3.0, 54.0, -22.0, 18.0, -32.0, -9.0, 10.0, 1.0, 1.0])
 """Action (11,) whose posture every episode starts from: the eye looks at the screen."""
 
-Y_RANGE_M: Final = (0.235, 0.285)
-YAW_RANGE_DEG: Final = (-15.0, 15.0)
-"""Ranges of both objects. Nearer than this the elbow cannot bend enough for a standing object at
-X = -0.15; farther, the hand comes down too slantingly on a laying object at X = 0.07."""
+Y_RANGE_M: Final = (0.235, 0.275)
+YAW_RANGE_DEG: Final = (-12.0, 12.0)
+"""Ranges of both objects.
+
+Nearer, the elbow cannot bend enough for a standing object at X = -0.15; farther, the hand does not
+come down to a laying object at X = 0.07; turned farther, the wrist cannot follow a standing object
+at X = 0.07.
+"""
 
 # The height of the table is where the arm reaches every family over the whole ranges.
 TABLE_SIZE_M: Final = (0.90, 0.44, 0.04)

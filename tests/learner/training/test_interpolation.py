@@ -154,3 +154,17 @@ def test_situations_with_different_discrete_values_are_not_neighbours() -> None:
     assert corners(grid, 0) == {(0, 1, 3, 4)}
     assert corners(grid, 9) == {(9, 9, 10, 10)}, "flat along the value that it does not have"
     assert corners(grid, 11) == {(11, 11, 11, 11)}
+
+
+def test_situations_that_differ_in_distractors_alone_lie_at_the_same_point() -> None:
+    situations = [
+        {"x_m": x, "other_m": other, "take": take}
+        for x, other, take in ((0.0, 0.1, "1"), (1.0, 0.2, "2"), (0.0, 0.3, "3"))
+    ]
+    chosen, generator = torch.arange(3).repeat(50), torch.Generator().manual_seed(1)
+    grid = NeighbourGrid(situations, [5, 5, 5], {"other_m", "take"})
+    mixtures = grid.mixtures(chosen, 1.0, generator)
+    partners = {(int(a), int(b)) for a, b in mixtures.members}
+    assert partners == {(0, 1), (1, 0), (1, 2), (2, 1)}
+    alone = NeighbourGrid(situations, [5, 5, 5]).mixtures(chosen, 1.0, generator)
+    assert all(len(set(members.tolist())) == 1 for members in alone.members)

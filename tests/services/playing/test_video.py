@@ -120,6 +120,35 @@ def test_an_episode_of_a_users_backend_is_replayed_with_it(
     assert eye.std() > 20, "something is to be seen"
 
 
+def write_gestures(folder: Path) -> None:
+    """Two gesture videos of an even grey."""
+    for side, grey in (("picture-left", 60), ("picture-right", 200)):
+        (folder / side).mkdir(parents=True)
+        name = str(folder / side / "take.avi")
+        writer = cv2.VideoWriter(name, cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (64, 64))
+        for _ in range(10):
+            writer.write(np.full((64, 64, 3), grey, dtype=np.uint8))
+        writer.release()
+
+
+def test_gestures_of_ones_own_are_replayed_on_the_screen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_gestures(tmp_path / "gestures")
+    options = ["--set", "task.name=experiment2", "--set", "task.gestures=gestures"]
+    blind = ["--set", "simulator.render=false", "--workers", "1"]
+    assert main(["tutor", "--cases", "0", "--repeats", "1", "--out", ".", *options, *blind]) == 0
+    episode = read_episode(Path("case00_repeat00.mcap"))
+    assert episode.situation["indicated_x_m"] == "-0.15"
+    write_episode(Path("short.mcap"), steps_of(episode, [0]))
+    assert main(["replay", "short.mcap", "--out", "video.mp4"]) == 2
+    assert "--set task.gestures=FOLDER" in capsys.readouterr().err
+    assert main(["replay", "short.mcap", "--out", "video.mp4", *options]) == 0
+    eye = read_video(Path("video.mp4"))[0][0][:, 640:]
+    assert eye[240, 320] == pytest.approx((200, 200, 200), abs=8), "the screen"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

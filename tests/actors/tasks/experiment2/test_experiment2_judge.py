@@ -81,7 +81,7 @@ def test_a_correct_grasp_is_precise():
 
 
 @pytest.mark.parametrize(
-    "hand", [{"hand_yaw": 12.0}, {"hand_yaw": -12.0}, {"along": 0.017}, {"across": -0.012}]
+    "hand", [{"hand_yaw": 9.0}, {"hand_yaw": -9.0}, {"along": 0.017}, {"across": -0.012}]
 )
 def test_a_wrongly_placed_hand_is_strict_but_imprecise(hand):
     outcome = judged(bodies(**hand))

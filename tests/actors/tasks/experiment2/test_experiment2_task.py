@@ -18,7 +18,7 @@ from proto.errors import UserError
 from sim_assets.gestures.drawing import draw_clip
 from sim_assets.gestures.subject import Subject
 
-FIXED = {"indicated_y_m": 0.26, "other_y_m": 0.26, "indicated_yaw_deg": 0.0, "other_yaw_deg": 0.0}
+FIXED = {"indicated_y_m": 0.255, "other_y_m": 0.255, "indicated_yaw_deg": 0.0, "other_yaw_deg": 0.0}
 
 
 def experiment2(**options):
@@ -93,7 +93,7 @@ def test_corners_combine_the_ends_of_the_ranges_with_every_case():
     corners = TASK.corners()
     assert len(corners) == 8 * 2**4
     assert {corner["take"] for corner in corners} == {"10"}
-    assert {corner["indicated_y_m"] for corner in corners} == {0.235, 0.285}
+    assert {corner["indicated_y_m"] for corner in corners} == {0.235, 0.275}
 
 
 @pytest.mark.parametrize(
@@ -126,11 +126,11 @@ def test_the_screen_shows_the_clip_of_the_indicated_side_and_then_is_dark(place,
 def test_objects_stand_at_their_places_in_different_shades():
     situation = {
         **TASK.sample(2), "indicated_x_m": "0.07", "indicated_kind": "standing",
-        "indicated_y_m": 0.28, "indicated_yaw_deg": 10.0, "other_kind": "laying",
+        "indicated_y_m": 0.27, "indicated_yaw_deg": 10.0, "other_kind": "laying",
     }  # fmt: skip
     boxes = {box.name: box for box in TASK.scene(situation).boxes}
     indicated, other = boxes["indicated_object"], boxes["other_object"]
-    assert indicated.pose.position_m == pytest.approx((-0.07, 0.28, 0.075))
+    assert indicated.pose.position_m == pytest.approx((-0.07, 0.27, 0.075))
     assert 2 * np.arcsin(indicated.pose.quaternion[3]) == pytest.approx(np.deg2rad(-10.0))
     assert other.pose.position_m[0] == pytest.approx(0.15)
     assert indicated.size_m == (0.028, 0.07, 0.15)
@@ -168,7 +168,7 @@ def test_baselines_ignore_the_variables_they_are_blind_to():
     assert kinds["indicated_kind"] != situation["indicated_kind"]
     assert kinds["indicated_y_m"] == situation["indicated_y_m"]
     middle = TASK.baselines["pose-blind"](situation)
-    assert middle["indicated_y_m"] == pytest.approx(0.26)
+    assert middle["indicated_y_m"] == pytest.approx(0.255)
     assert middle["indicated_yaw_deg"] == 0.0
     assert middle["indicated_kind"] == situation["indicated_kind"]
     for belief in TASK.baselines.values():
@@ -194,7 +194,7 @@ def test_the_tutor_lifts_the_indicated_object_in_every_case(physics, number):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(128))
-def test_the_tutor_is_right_at_every_corner(physics, number):
+def test_the_tutor_is_precise_at_every_corner(physics, number):
     assert outcome(physics, "tutor", TASK.corners()[number]).precise
 
 
