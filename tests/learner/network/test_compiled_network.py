@@ -160,13 +160,8 @@ def test_wrong_sizes_are_refused() -> None:
         CompiledNetwork(config, other)
 
 
-def test_without_a_compiler_numpy_acts(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: object, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
-    monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
+@pytest.mark.usefixtures("no_compiler")
+def test_without_a_compiler_numpy_acts(caplog: pytest.LogCaptureFixture) -> None:
     acting_library.cache_clear()
     try:
         config = NetworkConfig()

@@ -226,13 +226,8 @@ def test_sequences_of_another_network_are_refused() -> None:
         divergence(network, Minibatch.of_all(sequences_for(other, [3])))
 
 
-def test_without_a_compiler_pytorch_computes_the_loss(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: object, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
-    monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
+@pytest.mark.usefixtures("no_compiler")
+def test_without_a_compiler_pytorch_computes_the_loss(caplog: pytest.LogCaptureFixture) -> None:
     learning_library.cache_clear()
     try:
         network = network_of(NetworkConfig())
