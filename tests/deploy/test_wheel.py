@@ -1,4 +1,4 @@
-"""The wheel works in an environment of its own, from any folder, without the repository."""
+"""The wheel works in a new environment, from any folder, without the repository."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def vmdnn(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return run
 
 
-def test_it_knows_its_version(vmdnn: Run) -> None:
+def test_it_has_its_version(vmdnn: Run) -> None:
     assert vmdnn("--version").stdout.startswith("vmdnn 0.")
 
 
@@ -84,7 +84,7 @@ def test_an_actor_starts_with_a_built_in_configuration(vmdnn: Run) -> None:
     assert "start one with `vmdnn hub`" in ended.stderr
 
 
-def test_a_configuration_that_there_is_not_is_named(vmdnn: Run) -> None:
+def test_an_unknown_configuration_is_named(vmdnn: Run) -> None:
     ended = vmdnn("inspect", "network", "--config", "smok")
     assert ended.returncode == 2
     assert "config file smok does not exist; built in are: experiment1, " in ended.stderr
