@@ -87,4 +87,5 @@ def test_an_actor_starts_with_a_built_in_configuration(vmdnn: Run) -> None:
 def test_an_unknown_configuration_is_named(vmdnn: Run) -> None:
     ended = vmdnn("inspect", "network", "--config", "smok")
     assert ended.returncode == 2
-    assert "config file smok does not exist; built in are: experiment1, " in ended.stderr
+    names = sorted(path.stem for path in (ROOT / "deploy" / "config").glob("*.yaml"))
+    assert f"config file smok does not exist; built in are: {', '.join(names)}" in ended.stderr
