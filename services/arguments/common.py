@@ -23,7 +23,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         "--config",
         type=config_argument,
         metavar="FILE|NAME",
-        help="YAML file, or a built-in configuration: experiment1, paper, smoke; without it, all"
+        help="YAML file, or a built-in configuration such as experiment1 or smoke; without it, all"
         " defaults",
     )
     parser.add_argument(

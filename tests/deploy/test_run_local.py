@@ -104,7 +104,7 @@ def test_a_process_with_bad_input_ends_the_run_with_its_message(tmp_path: Path) 
     with started(tmp_path, "--backend", "nosuchsimulator") as process:
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 2
-    assert "there is no backend 'nosuchsimulator'" in errors
+    assert "there is no 'nosuchsimulator'" in errors
     assert not processes_that_name(str(tmp_path))
 
 

@@ -1,4 +1,4 @@
-"""Which clips are tutored and which are shown in trials: the task's options and what they give."""
+"""The task's options, and the clips that are tutored and shown in trials by them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim_assets.gestures.clip import GestureLibrary
 from sim_assets.gestures.drawing import DrawnGestures
 from sim_assets.gestures.videos import GestureVideoError, RecordedGestures
 
-OPTIONS: Final = frozenset({"subjects", "takes", "poses", "trials_show", "gestures"})
+OPTIONS: Final = frozenset({"subjects", "takes", "poses", "trials_show", "gestures", "delay_steps"})
 DRAWN_OPTIONS: Final = ("subjects", "takes", "trials_show")
 """Options that a folder of videos decides."""
 NEW_TAKES: Final = "new-takes"
@@ -72,20 +72,31 @@ def clips_of(options: Mapping[str, Any], task: str) -> Clips:
     return _recorded(options["gestures"])
 
 
-def count_of(options: Mapping[str, Any], name: str, default: int) -> int:
-    """The value of an option that is a number of things.
+def whole_number(
+    options: Mapping[str, Any], name: str, default: int, *, least: int = 1, most: int | None = None
+) -> int:
+    """Return the value of an option that is a whole number.
+
+    Args:
+        options: the options that are set.
+        name: name of the option.
+        default: its value if it is not set.
+        least: smallest value that is allowed.
+        most: largest value that is allowed; None for no limit.
 
     Raises:
-        UserError: it is no whole number of at least 1.
+        UserError: the value is not a whole number, or not in the allowed range.
     """
     value = options.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-        raise UserError(f"task.{name} = {value!r} is no whole number of at least 1")
-    return value
+    valid = isinstance(value, int) and not isinstance(value, bool)
+    if not valid or value < least or (most is not None and value > most):
+        limits = f"of at least {least}" if most is None else f"from {least} to {most}"
+        raise UserError(f"task.{name} = {value!r} is not a whole number {limits}")
+    return int(value)
 
 
 def _drawn(options: Mapping[str, Any], task: str) -> Clips:
-    subjects, takes = count_of(options, "subjects", 1), count_of(options, "takes", 10)
+    subjects, takes = whole_number(options, "subjects", 1), whole_number(options, "takes", 10)
     shown = options.get("trials_show", NEW_TAKES)
     if shown not in {NEW_TAKES, NEW_SUBJECTS}:
         raise UserError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from typing import Final
 
@@ -13,7 +14,7 @@ from actors.kinematics import Gaze
 from actors.motion import move_through, ramp
 from actors.tasks.experiment2.postures import FamilyPostures, load_key_postures
 from actors.tasks.experiment2.setting import PlacedObject, Setting
-from actors.tasks.experiment2.world import START, SUBTASKS, TABLE_DROP_M
+from actors.tasks.experiment2.world import START, SUBTASKS, TABLE_DROP_M, first_steps
 from proto.body import ARM, FOCUS, GRASP, NECK
 from proto.variables import Situation
 
@@ -30,18 +31,21 @@ LIFTING_STEPS: Final = 14
 TASK_SPACE_M: Final = np.array([0.04, 0.25, 0.04])
 """Point between the two places (world frame) at which the robot sees both."""
 
-_TOTAL: Final = sum(SUBTASKS.values())
 
+def plan(situation: Situation, subtasks: Mapping[str, int] = SUBTASKS) -> Array:
+    """Return the tutor's actions (T, 11) in a situation (see `proto.body`).
 
-def plan(situation: Situation) -> Array:
-    """Actions (148, 11) that carry out Experiment II in a situation (see `proto.body`)."""
+    Args:
+        situation: the situation.
+        subtasks: number of control steps of each subtask, T in all; see `world.delayed_subtasks`.
+    """
     target = Setting.of(situation).indicated
-    begins = dict(zip(SUBTASKS, np.cumsum([0, *SUBTASKS.values()]).tolist(), strict=False))
-    actions = np.tile(START, (_TOTAL, 1))
-    actions[:, ARM] = _arm(target, load_key_postures().for_object(target))
-    actions[:, NECK] = _neck(target, begins)
-    actions[:, GRASP] = 1.0 + 9.0 * ramp(_TOTAL, begins["grasp"], CLOSING_STEPS)
-    actions[:, FOCUS] = 1.0 + 19.0 * ramp(_TOTAL, begins["approach"], FOCUS_STEPS)
+    begins, total = first_steps(subtasks), sum(subtasks.values())
+    actions = np.tile(START, (total, 1))
+    actions[:, ARM] = _arm(target, load_key_postures().for_object(target), subtasks)
+    actions[:, NECK] = _neck(target, begins, total)
+    actions[:, GRASP] = 1.0 + 9.0 * ramp(total, begins["grasp"], CLOSING_STEPS)
+    actions[:, FOCUS] = 1.0 + 19.0 * ramp(total, begins["approach"], FOCUS_STEPS)
     return clip_action(actions)  # between key postures a joint may pass its limit by a degree
 
 
@@ -50,19 +54,19 @@ def _gaze() -> Gaze:
     return Gaze(TABLE_DROP_M)
 
 
-def _neck(target: PlacedObject, begins: dict[str, int]) -> Array:
-    """Neck pitch and yaw (148, 2): the screen, then the task space, then the object."""
+def _neck(target: PlacedObject, begins: Mapping[str, int], total: int) -> Array:
+    """Neck pitch and yaw (total, 2): the screen, then the task space, then the object."""
     at_task_space = _gaze().neck_deg(TASK_SPACE_M)
     at_object = _gaze().neck_deg(np.array(target.pose.position_m))
-    first = ramp(_TOTAL, begins["attend task space"], DOWNWARD_STEPS)[:, None]
-    second = ramp(_TOTAL, begins["attend object"], GAZE_STEPS)[:, None]
+    first = ramp(total, begins["attend task space"], DOWNWARD_STEPS)[:, None]
+    second = ramp(total, begins["attend object"], GAZE_STEPS)[:, None]
     return np.asarray(
         START[NECK] + (at_task_space - START[NECK]) * first + (at_object - at_task_space) * second
     )
 
 
-def _arm(target: PlacedObject, postures: FamilyPostures) -> Array:
-    """Arm postures (148, 7): each subtask moves through its key postures or rests."""
+def _arm(target: PlacedObject, postures: FamilyPostures, subtasks: Mapping[str, int]) -> Array:
+    """Arm postures (T, 7): each subtask moves through its key postures or rests."""
 
     def posture(name: str) -> Array:
         return START[ARM] if name == "start" else postures.arm_deg(name, target)
@@ -70,15 +74,14 @@ def _arm(target: PlacedObject, postures: FamilyPostures) -> Array:
     def through(*names: str, moving: int, total: int) -> Array:
         return move_through([posture(name) for name in names], moving, total)
 
-    n = SUBTASKS
-    waiting = sum(n[name] for name in list(n)[:4])
-    reach, approach = n["reach above object"], n["approach"]
+    resting = first_steps(subtasks)["reach above object"]
+    reach, approach = subtasks["reach above object"], subtasks["approach"]
     return np.concatenate(
         [
-            np.tile(posture("start"), (waiting, 1)),
+            np.tile(posture("start"), (resting, 1)),
             through("start", "passing", "above", moving=reach, total=reach),
             through("above", "approach_1", "approach_2", "grasp", moving=approach, total=approach),
-            np.tile(posture("grasp"), (n["grasp"], 1)),
-            through("grasp", "lift_1", "lift_2", moving=LIFTING_STEPS, total=n["lift"]),
+            np.tile(posture("grasp"), (subtasks["grasp"], 1)),
+            through("grasp", "lift_1", "lift_2", moving=LIFTING_STEPS, total=subtasks["lift"]),
         ]
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import Final
 
@@ -12,10 +12,10 @@ from actors.simulator import Scene
 from actors.tasks.contract import Array, Task
 from actors.tasks.experiment2 import world
 from actors.tasks.experiment2.baselines import BASELINES
-from actors.tasks.experiment2.clips import OPTIONS, Clips, clips_of, count_of
+from actors.tasks.experiment2.clips import OPTIONS, Clips, clips_of, whole_number
 from actors.tasks.experiment2.figure_words import FIGURE_WORDS
 from actors.tasks.experiment2.judge import Experiment2Judge
-from actors.tasks.experiment2.plan import plan
+from actors.tasks.experiment2.plan import GAZE_STEPS, plan
 from actors.tasks.experiment2.setting import (
     INDICATED_X,
     KINDS,
@@ -43,32 +43,20 @@ TUTORED_POSES: Final = tuple(
 )
 """Y and yaw of tutored objects, the middle of the ranges first."""
 _CLIP_SEED: Final = 17
-_STEPS: Final = sum(world.SUBTASKS.values())
-
-
-def _window(first: int, last: int) -> tuple[float, float]:
-    """Control steps as shares of an episode."""
-    return (first / _STEPS, last / _STEPS)
+_GESTURE_SEEN: Final = 20
+"""Control step from which pre-training asks where the person points."""
 
 
 class Experiment2(Task):
     """Experiment II. Trials are uniform inside the ranges, with clips that were not tutored.
 
-    Options: see `actors.tasks.experiment2.clips.clips_of`; and `poses` (9), the number of tutored
-    poses of the objects in each of the paper's eight cases.
+    Options: those of `actors.tasks.experiment2.clips.clips_of`; `poses` (9), the number of tutored
+    poses of the objects in each of the paper's eight cases; and `delay_steps` (0), the number of
+    control steps after the gesture in which the robot looks at the dark screen and waits.
     """
 
     name = "experiment2"
-    subtasks = world.SUBTASKS
     start = world.START
-    # The gesture is asked for until the head turns to the object, which would give the answer away;
-    # kind and pose of the object are asked for once it is in view.
-    questions = (
-        Question("indicated_x_m", window=_window(20, 58)),
-        Question("indicated_kind", window=_window(64, 94)),
-        Question("indicated_y_m", 3, window=_window(74, 128)),
-        Question("indicated_yaw_deg", 3, window=_window(74, 128)),
-    )
     distractors = frozenset({"other_y_m", "other_yaw_deg", SUBJECT, TAKE})
     baselines = BASELINES
     figure_words = FIGURE_WORDS
@@ -82,7 +70,11 @@ class Experiment2(Task):
         """
         super().__init__(config)
         self._clips = clips_of(config.options, self.name)
-        self._poses = count_of(config.options, "poses", len(TUTORED_POSES))
+        self._poses = whole_number(config.options, "poses", len(TUTORED_POSES))
+        self.subtasks = world.delayed_subtasks(
+            whole_number(config.options, "delay_steps", 0, least=0, most=world.LONGEST_DELAY)
+        )
+        self.questions = _questions(self.subtasks)
         self.variables = _variables(self._clips.subjects, self._clips.takes)
         self._trial_variables = _variables(self._clips.trial_subjects, self._clips.trial_takes)
 
@@ -129,12 +121,33 @@ class Experiment2(Task):
         return world.scene(setting, clip)
 
     def plan(self, situation: Situation) -> Array:
-        """The tutor's actions (148, 11)."""
-        return plan(situation)
+        """Return the tutor's actions (T, 11); T is 148 without a delay."""
+        return plan(situation, self.subtasks)
 
     def judge(self, situation: Situation) -> Experiment2Judge:
         """A judge for one episode of a situation."""
         return Experiment2Judge(situation)
+
+
+def _questions(subtasks: Mapping[str, int]) -> tuple[Question, ...]:
+    """Return the questions of pre-training, each with its window in the sequence.
+
+    The indicated place is asked for until the head turns to the object, because later pictures show
+    the answer. Kind and pose are asked for while the object is in view.
+    """
+    total, begins = sum(subtasks.values()), world.first_steps(subtasks)
+
+    def window(first: int, last: int) -> tuple[float, float]:
+        return (first / total, last / total)
+
+    kind_seen = begins["attend object"] + GAZE_STEPS
+    pose = window(begins["reach above object"] + GAZE_STEPS, begins["lift"])
+    return (
+        Question(INDICATED_X, window=window(_GESTURE_SEEN, begins["attend object"])),
+        Question("indicated_kind", window=window(kind_seen, begins["approach"])),
+        Question("indicated_y_m", 3, window=pose),
+        Question("indicated_yaw_deg", 3, window=pose),
+    )
 
 
 def _variables(subjects: tuple[str, ...], takes: tuple[str, ...]) -> tuple[Variable, ...]:

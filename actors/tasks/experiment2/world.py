@@ -22,7 +22,11 @@ SUBTASKS: Final[Mapping[str, int]] = {
     "grasp": 14,
     "lift": 20,
 }
-"""The eight subtasks of the paper and the control steps that each takes."""
+"""The eight subtasks of the paper and the number of control steps of each."""
+WAIT: Final = "wait"
+"""Name of the subtask between the gesture and the turn of the head, if there is a delay."""
+LONGEST_DELAY: Final = 200
+"""Largest number of control steps of that subtask."""
 
 START: Final = np.array([26.4, -1.8, -3.0, 54.0, -22.0, 18.0, -32.0, -9.0, 10.0, 1.0, 1.0])
 """Action (11,) whose posture every episode starts from: the eye looks at the screen."""
@@ -52,6 +56,22 @@ COLOURS: Final[Mapping[Kind, tuple[float, float, float]]] = {
     "laying": (0.85, 0.30, 0.10),
 }
 """The kinds differ in shade, so that a picture of 64 x 48 grey pixels tells them apart."""
+
+
+def delayed_subtasks(delay_steps: int) -> Mapping[str, int]:
+    """Return the subtasks with a delay after the gesture; without delay the eight of the paper."""
+    if not delay_steps:
+        return SUBTASKS
+    gesture, *others = SUBTASKS.items()
+    return dict([gesture, (WAIT, delay_steps), *others])
+
+
+def first_steps(subtasks: Mapping[str, int]) -> dict[str, int]:
+    """Return the control step at which each subtask begins."""
+    ends = np.cumsum(list(subtasks.values()))
+    return {
+        name: int(end) - steps for (name, steps), end in zip(subtasks.items(), ends, strict=True)
+    }
 
 
 def scene(setting: Setting, clip: Clip) -> Scene:

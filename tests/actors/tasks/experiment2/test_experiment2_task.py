@@ -44,6 +44,38 @@ def test_an_episode_has_eight_subtasks_and_begins_with_the_gesture():
     assert (TASK.phases[:40] == 0).all()
 
 
+def test_a_delay_is_a_subtask_after_the_gesture():
+    task = experiment2(delay_steps=30)
+    assert list(task.subtasks.items())[:3] == [
+        ("observe gesture", 40),
+        ("wait", 30),
+        ("attend task space", 8),
+    ]
+    assert len(task.phases) == 178
+    assert (task.phases[40:70] == 1).all()
+    assert experiment2(delay_steps=0).subtasks == TASK.subtasks
+
+
+@pytest.mark.parametrize("delay", [0, 30, 200])
+def test_a_delay_stops_the_plan_while_the_screen_is_dark(delay):
+    task, situation = experiment2(delay_steps=delay), TASK.sample(3)
+    plan, without = task.plan(situation), TASK.plan(situation)
+    np.testing.assert_array_equal(plan[: 40 + delay], np.tile(task.start, (40 + delay, 1)))
+    np.testing.assert_array_equal(plan[40 + delay :], without[40:])
+    screen = task.scene(situation).screen
+    assert all((screen.frame(step) == DARK_SCREEN).all() for step in range(40, 40 + delay))
+
+
+def test_a_delay_moves_the_windows_of_the_questions():
+    """The gesture is asked for from the same step on, and until the head turns."""
+    for question, delayed in zip(
+        TASK.questions, experiment2(delay_steps=52).questions, strict=True
+    ):
+        first, last = (round(148 * share) for share in question.window)
+        shift = 0 if question.variable == "indicated_x_m" else 52
+        assert [round(200 * share) for share in delayed.window] == [first + shift, last + 52]
+
+
 def test_the_first_eight_tutored_cases_are_those_of_the_paper():
     cases = TASK.tutored()[:8]
     assert len({case_of(case) for case in cases}) == 8
@@ -87,6 +119,8 @@ def test_trials_can_show_new_subjects():
     assert {case["subject"] for case in task.tutored()} == set("0123")
     assert {trial["subject"] for trial in trials} == {str(seed) for seed in range(4, 12)}
     assert {trial["take"] for trial in trials} == set("012")
+    for situation in (*task.tutored(), *trials, *task.corners()):
+        task.check(situation)
 
 
 def test_corners_combine_the_ends_of_the_ranges_with_every_case():
@@ -99,9 +133,11 @@ def test_corners_combine_the_ends_of_the_ranges_with_every_case():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"subjects": 0}, "task.subjects = 0 is no whole number of at least 1"),
-        ({"takes": 2.5}, "task.takes = 2.5 is no whole number"),
-        ({"poses": True}, "task.poses = True is no whole number"),
+        ({"subjects": 0}, "task.subjects = 0 is not a whole number of at least 1"),
+        ({"takes": 2.5}, "task.takes = 2.5 is not a whole number"),
+        ({"poses": True}, "task.poses = True is not a whole number"),
+        ({"delay_steps": -1}, "task.delay_steps = -1 is not a whole number from 0 to 200"),
+        ({"delay_steps": 201}, "task.delay_steps = 201 is not a whole number from 0 to 200"),
         ({"trials_show": "all"}, "task.trials_show = 'all': trials of experiment2 show new-takes"),
         ({"persons": 3}, "task.persons: the task experiment2 has no such option"),
         ({"gestures": "/nowhere"}, "task.gestures: /nowhere: there is no such folder"),
@@ -182,14 +218,18 @@ def physics():
     simulator.close()
 
 
-def outcome(simulator, policy, situation):
-    played = make_policy(policy, TASK)
-    return play(simulator, TASK, played, situation, seed=1, kind=Kind.TRIAL).outcome
+def outcome(simulator, policy, situation, task=TASK):
+    played = make_policy(policy, task)
+    return play(simulator, task, played, situation, seed=1, kind=Kind.TRIAL).outcome
 
 
 @pytest.mark.parametrize("number", range(8))
 def test_the_tutor_lifts_the_indicated_object_in_every_case(physics, number):
     assert outcome(physics, "tutor", TASK.tutored()[number]).precise
+
+
+def test_the_tutor_lifts_the_indicated_object_after_a_delay(physics):
+    assert outcome(physics, "tutor", TASK.tutored()[0], experiment2(delay_steps=60)).precise
 
 
 @pytest.mark.slow
