@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from proto.cache import cache_folder
-from sim_assets.hand import PHALANGES, joints_from_motors
+from sim_assets.hand import GRASP_CENTRE_M, PHALANGES, joints_from_motors
 from sim_assets.icub import (
     ARM_JOINTS,
     EYE,
@@ -76,6 +76,11 @@ class ArmPose:
     rotation: Array
     position_m: Array
     points_m: Array
+
+    @property
+    def grasp_centre_m(self) -> Array:
+        """Grasp centre (3,) of the hand."""
+        return np.asarray(self.rotation @ GRASP_CENTRE_M + self.position_m)
 
 
 class Arm:
@@ -142,6 +147,14 @@ class Arm:
             position_m=_ROOT_IN_WORLD @ hand.translation + self._offset_m,
             points_m=points @ _ROOT_IN_WORLD.T + self._offset_m,
         )
+
+    def clearances(self, pose: ArmPose, box: ClearanceBox) -> Array:
+        """Return the distances (N,) of the spheres from a box; negative inside (m)."""
+        return np.asarray(box.distance(pose.points_m) - self.radii_m)
+
+    def heights(self, pose: ArmPose) -> Array:
+        """Return the distances (N,) of the spheres above the table top; negative below (m)."""
+        return np.asarray(pose.points_m[:, 2] - self.radii_m)
 
 
 def _sample(collider: Collider, spacing_m: float = 0.015) -> tuple[Array, float]:

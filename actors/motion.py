@@ -46,6 +46,17 @@ def interpolate_postures(postures: Sequence[Array], fraction: Array | float) -> 
     return np.asarray(spline(fraction))
 
 
+def move_through(postures: Sequence[Array], moving: int, total: int) -> Array:
+    """Return a movement (total, 7) through postures with a minimum-jerk profile, followed by rest.
+
+    Args:
+        postures: at least two postures, each (7,).
+        moving: control steps of the movement.
+        total: control steps of movement and rest.
+    """
+    return interpolate_postures(postures, minimum_jerk(np.arange(1, total + 1) / moving))
+
+
 def execution_noise(steps: int, seed: int, amplitude_deg: float, correlation_steps: float) -> Array:
     """Return smooth Gaussian noise (T, 11) for actions.
 

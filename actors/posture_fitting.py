@@ -8,10 +8,15 @@ situation, and its coefficients are fitted to a grid of situations together.
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib.resources import as_file
+from importlib.resources.abc import Traversable
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from actors.kinematics import Arm
+from proto.storage import written_whole
 
 Array = NDArray[np.float64]
 Residual = Callable[[Array, int], Array]
@@ -81,6 +86,23 @@ def linearize(postures: Array, residual: Residual) -> tuple[list[Array], list[Ar
         values.append(value)
         jacobians.append(np.stack(columns, axis=1))
     return values, jacobians, sum(float(value @ value) for value in values)
+
+
+def limit_violations(arm: Arm, posture: Array) -> Array:
+    """Return residuals (7,) of joint angles that are closer to a limit than LIMIT, in its units."""
+    beyond = np.maximum(arm.minimum_rad - posture, posture - arm.maximum_rad) + LIMIT
+    return np.asarray(np.maximum(0.0, beyond) / LIMIT)
+
+
+def write_postures(file: Traversable, text: str) -> None:
+    """Write fitted postures to a file of a package.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
+    with as_file(file) as path, written_whole(path) as stream:
+        stream.write(text.encode())
+    print(f"wrote {file}")
 
 
 def shortfall(distance: Array | float, margin: float) -> Array:

@@ -1,4 +1,4 @@
-"""What several folders of tests need."""
+"""Fixtures for several folders of tests."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
 from proto.episode import Episode, Kind
 from proto.messages import EpisodeFailed
 
-# how long an example takes says more of what else the machine does than of the code
+# The time of an example depends on the load of the machine, so hypothesis must not limit it.
 settings.register_profile("patient", deadline=None)
 settings.load_profile("patient")
 
 
 @pytest.fixture(scope="session")
 def make_episode() -> Callable[..., Episode]:
-    """Make an episode that is different in every step; fields can be given by name."""
+    """Return a function that makes an episode with different values in every step.
+
+    Fields can be given by name.
+    """
 
     def make(steps: int = 40, **given: Any) -> Episode:
         random = np.random.default_rng(steps)
@@ -60,7 +63,10 @@ def make_episode() -> Callable[..., Episode]:
 
 @pytest.fixture(scope="session")
 def failure() -> Callable[..., EpisodeFailed]:
-    """Make the report that a simulation failed; fields can be given by name."""
+    """Return a function that makes the report of a failed simulation.
+
+    Fields can be given by name.
+    """
 
     def make(name: str, **given: Any) -> EpisodeFailed:
         report = EpisodeFailed(

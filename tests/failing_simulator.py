@@ -1,4 +1,4 @@
-"""A simulator whose physics fails, as a backend of one's own."""
+"""A user's backend whose physics fails."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from actors.simulator import Array, Scene, StepReport
 
 
 class FailingSimulator(SapienSimulator):
-    """Plays its first episode as it should; in all others the joints are NaN from step 3 on."""
+    """Plays its first episode correctly; in all others the joints are NaN from step 3 on."""
 
     name = "failing"
     _episode = 0

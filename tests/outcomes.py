@@ -6,7 +6,7 @@ from proto.episode import NO_FAILURE, Measure, Outcome
 
 
 def measures(**changed: float) -> dict[str, Measure]:
-    """What the judge of Experiment I measures in a good grasp, some values changed."""
+    """Return the measures of a good grasp in Experiment I, with some values changed."""
     values = {
         "lifted_m": (0.1, "m"),
         "moved_mm": (1.0, "mm"),

@@ -6,7 +6,7 @@ import socket
 
 
 def free_endpoint() -> str:
-    """A TCP endpoint on this machine at which nothing listens."""
+    """Return a TCP endpoint on this machine that is not in use."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -1,4 +1,4 @@
-"""Real processes for tests: started with a time limit, stopped whatever happens."""
+"""Starts and stops real processes for tests, with time limits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PATIENCE_S = 60.0
 
 @contextmanager
 def vmdnn(*words: str | Path, log: Path | None = None) -> Iterator[subprocess.Popen[bytes]]:
-    """`vmdnn WORDS` as a process of its own; killed at the end if it still runs."""
+    """Run `vmdnn WORDS` in another process, which is killed when the context ends."""
     command = [sys.executable, "-m", "services.cli", *map(str, words)]
     with (log or Path("/dev/null")).open("ab") as stream:
         process = subprocess.Popen(command, stdout=stream, stderr=stream)
@@ -28,7 +28,7 @@ def vmdnn(*words: str | Path, log: Path | None = None) -> Iterator[subprocess.Po
 
 @contextmanager
 def listening_hub(endpoint: str, *words: str | Path) -> Iterator[subprocess.Popen[bytes]]:
-    """`vmdnn hub` as a process of its own that accepts connections."""
+    """Run `vmdnn hub` in another process, and wait until it accepts connections."""
     host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
 
     def listens() -> bool:
@@ -41,7 +41,7 @@ def listening_hub(endpoint: str, *words: str | Path) -> Iterator[subprocess.Pope
 
 
 def run_vmdnn(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    """`vmdnn WORDS` until it ends."""
+    """Run `vmdnn WORDS` in another process until it ends."""
     return subprocess.run(
         [sys.executable, "-m", "services.cli", *map(str, words)],
         capture_output=True,
@@ -52,13 +52,13 @@ def run_vmdnn(*words: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def stop(process: subprocess.Popen[bytes]) -> int:
-    """Ask a process to stop, and return its exit status."""
+    """Stop a process with SIGTERM and return its exit status."""
     process.terminate()
     return process.wait(PATIENCE_S)
 
 
 def eventually(reached: Callable[[], bool], what: str, patience_s: float = PATIENCE_S) -> None:
-    """Wait until something holds; fail if it never does."""
+    """Wait until `reached` returns true; fail after `patience_s` seconds."""
     over_s = time.monotonic() + patience_s
     while not reached():
         assert time.monotonic() < over_s, f"never happened: {what}"

@@ -1,4 +1,4 @@
-"""Metrics as the processes of a run publish them, for tests of what shows them."""
+"""Metrics of a run's processes, for tests of the displays."""
 
 from __future__ import annotations
 

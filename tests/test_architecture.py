@@ -1,4 +1,4 @@
-"""Rules of the whole project: which way imports run, and who writes to disk."""
+"""Rules of the whole project: allowed imports, and modules that may write to disk."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ ONLY_IN = {
     "sapien": "actors/backends/sapien/",
     "mujoco": "actors/backends/mujoco/",
 }
-"""Packages that are imported in one place only."""
+"""Packages that may be imported in one place only."""
 
 MAY_WRITE = {
     "proto/storage.py": "all writing goes through it",
     "proto/run_locks.py": "an empty file that is locked; nothing is kept in it",
-    "sim_assets/icub_visuals.py": "a cache, built in a folder that is renamed when it is whole",
+    "sim_assets/icub_visuals.py": "a cache, built in a folder that is renamed when it is complete",
 }
 WRITERS = {"write_text", "write_bytes", "imwrite", "savez", "savez_compressed", "tofile"}
 
@@ -39,7 +39,7 @@ class Source:
 
     Attributes:
         name: path from the root.
-        tree: what it says.
+        tree: its syntax tree.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Source:
         return self.name.partition("/")[0]
 
     def imports(self) -> Iterator[str]:
-        """Every module that is imported, also inside functions."""
+        """Yield every module that is imported, also inside functions."""
         for node in ast.walk(self.tree):
             if isinstance(node, ast.Import):
                 yield from (alias.name for alias in node.names)
@@ -59,7 +59,7 @@ class Source:
                 yield node.module or ""
 
     def writes(self) -> Iterator[int]:
-        """Lines that open a file for writing, or write a file without opening it."""
+        """Yield the lines that open a file for writing, or call a function that writes a file."""
         for node in ast.walk(self.tree):
             if isinstance(node, ast.Call):
                 called = _called(node)
@@ -108,8 +108,8 @@ def test_some_packages_are_imported_in_one_place_only(package: str, place: str) 
     assert [name for name in importing if not name.startswith(place)] == []
 
 
-def test_kernels_know_nothing_of_the_rest_of_the_learner() -> None:
-    """They take and return arrays, so they need no network, no training and no config."""
+def test_kernels_import_nothing_else_of_the_learner() -> None:
+    """They take and return arrays, and must not depend on network, training or config."""
     foreign = [
         f"{source.name} imports {module}"
         for source in SOURCES

@@ -1,4 +1,4 @@
-"""`import vmdnn` works as docs/python.md says, and notices packages that took our names."""
+"""`import vmdnn` works as in docs/python.md, and detects packages that replaced ours."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_t
 
 
 @pytest.mark.parametrize("number", range(len(BLOCKS)))
-def test_each_block_of_the_page_runs_by_itself(
+def test_each_code_block_of_the_page_runs_alone(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert len(BLOCKS[number].splitlines()) < 20
@@ -26,7 +26,7 @@ def test_each_block_of_the_page_runs_by_itself(
     exec(compile(BLOCKS[number], f"docs/python.md, block {number}", "exec"), {})
 
 
-def test_a_policy_of_ones_own_is_found_by_name(
+def test_a_users_policy_is_found_by_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "still.py").write_text(BLOCKS[-1])
@@ -39,7 +39,7 @@ def test_a_policy_of_ones_own_is_found_by_name(
     assert "it lacks: step" in capsys.readouterr().err
 
 
-def test_everything_public_is_there_and_documented() -> None:
+def test_every_public_name_exists_and_is_documented() -> None:
     for name in vmdnn.__all__:
         thing = getattr(vmdnn, name)
         assert name == "__version__" or thing.__doc__, name
@@ -53,8 +53,8 @@ def test_the_command_needs_no_torch_to_start() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
-def test_a_package_that_took_one_of_our_names_is_noticed(tmp_path: Path) -> None:
-    """As proto-plus does when it is installed after vmdnn: it overwrites `proto/__init__.py`."""
+def test_a_package_that_replaced_one_of_ours_is_reported(tmp_path: Path) -> None:
+    """proto-plus overwrites `proto/__init__.py` when it is installed after vmdnn."""
     for name in ("proto", "sim_assets", "learner", "actors", "services"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_bytes((ROOT / name / "__init__.py").read_bytes())

@@ -35,6 +35,27 @@ class HandOffset:
     across_mm: float
 
 
+@dataclass(frozen=True)
+class GraspTolerance:
+    """Largest errors of a precise grasp.
+
+    Attributes:
+        yaw_error_deg, along_mm, across_mm: largest magnitudes of the attributes of `HandOffset`.
+    """
+
+    yaw_error_deg: float
+    along_mm: float
+    across_mm: float
+
+    def allows(self, hand: HandOffset) -> bool:
+        """Return whether a pose of the hand is within the tolerance."""
+        return (
+            abs(hand.yaw_error_deg) <= self.yaw_error_deg
+            and abs(hand.along_mm) <= self.along_mm
+            and abs(hand.across_mm) <= self.across_mm
+        )
+
+
 def closed_at(joints_deg: Iterable[Array]) -> int:
     """Return the first step from which the hand stays closed to the end, or -1.
 

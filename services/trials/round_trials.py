@@ -93,6 +93,6 @@ def open_run(folder: Path) -> Run:
     if not policies:
         raise UserError(
             f"{folder} has no policy that was published at epoch {config.learner.epochs}, the end"
-            " of coupled training before any corrections; let the run go on to there"
+            " of coupled training before any corrections; continue the run until then"
         )
     return Run(folder, config, policies)

@@ -1,7 +1,7 @@
 """Training and testing of many networks: variants of a config, each with several seeds.
 
 Each network has a folder like that of a run: config, checkpoints, policies and counted trials.
-Work that is done already is not repeated, so a sweep goes on where it was stopped.
+Work that is done already is not repeated, so a stopped sweep can be continued.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ def train(
     pretraining_store: TutoringStore | None,
     go_on: Callable[[float], bool],
 ) -> bool:
-    """Train a network from random weights, or go on with its training; whether it is finished.
+    """Train a network from random weights, or continue its training; return whether it is done.
 
     Networks share nothing, not even the pre-trained vision: the PFC takes part in pre-training, so
     its time constant makes a difference there too.

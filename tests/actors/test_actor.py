@@ -1,4 +1,4 @@
-"""The actor as a process: plays what is asked for, physics only, and loses nothing."""
+"""The actor as a process plays the requested episodes and loses nothing; without rendering."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ TASK = make_task(TaskConfig())
 def policy(
     make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory
 ) -> Callable[..., PolicyVersion]:
-    """Make a policy version of a network that was hardly trained."""
+    """Return a function that makes versions of a policy that was trained for one epoch."""
     store = TutoringStore(tmp_path_factory.mktemp("tutoring"))
     store.add(make_episode(20, kind=Kind.TUTORING, situation=dict(TASK.tutored()[0])))
     config = Config(learner=LearnerConfig(pretraining=PretrainingConfig(epochs=0)))
@@ -68,7 +68,7 @@ def policy(
 
 
 class ActorSetup:
-    """A hub, an actor, and a session that acts as learner and evaluator."""
+    """A hub, an actor, and a session that plays the role of learner and evaluator."""
 
     def __init__(self, stack: ExitStack, folder: Path) -> None:
         self._stack = stack
@@ -85,7 +85,7 @@ class ActorSetup:
         self.sequences: list[Episode] = []
         self.rollouts: list[Rollout] = []
         self.lives: list[Live] = []
-        self.told: ActorMetrics | None = None
+        self.metrics: ActorMetrics | None = None
         self.failures: list[EpisodeFailed] = []
         self.gives_receipts = True
         self.refusal = ""
@@ -109,17 +109,18 @@ class ActorSetup:
         self.hub = self._stack.enter_context(listening_hub(self.endpoint))
 
     def start_actor(self, *more: str) -> None:
-        self.told = None
+        self.metrics = None
         words = (*self.words, "--id", "actor-1", *more)
         self.actor = self._stack.enter_context(vmdnn("actor", *words, log=self.log))
 
     def publish(self, policy: PolicyVersion) -> None:
         self.bus.publish_newest(self.bus.keys.policy, policy)
 
-    def tells(self, what: Callable[[ActorMetrics], bool]) -> ActorMetrics:
-        eventually(lambda: self.told is not None and what(self.told), "the metrics it should tell")
-        assert self.told is not None
-        return self.told
+    def wait_for_metrics(self, ready: Callable[[ActorMetrics], bool]) -> ActorMetrics:
+        """Wait until the newest metrics satisfy `ready`."""
+        eventually(lambda: self.metrics is not None and ready(self.metrics), "the expected metrics")
+        assert self.metrics is not None
+        return self.metrics
 
     def command(self, command: Command) -> list[str]:
         control = self.bus.keys.control(Role.ACTOR)
@@ -142,7 +143,7 @@ class ActorSetup:
         self._acknowledge(rollout.episode)
 
     def _on_metrics(self, metrics: ActorMetrics) -> None:
-        self.told = metrics
+        self.metrics = metrics
 
     def _on_failure(self, report: EpisodeFailed) -> None:
         self.failures.append(report)
@@ -160,7 +161,7 @@ def setup(tmp_path: Path) -> Iterator[ActorSetup]:
         yield ActorSetup(stack, tmp_path)
 
 
-def test_it_shows_cases_plays_trials_and_practises(
+def test_it_demonstrates_cases_plays_trials_and_practises(
     setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     setup.cases += [
@@ -182,10 +183,10 @@ def test_it_shows_cases_plays_trials_and_practises(
     assert np.array_equal(clean.actions, clean.targets)
     assert not np.array_equal(noisy.actions, noisy.targets)
     assert np.array_equal(noisy.targets, clean.targets)
-    told = setup.tells(lambda told: told.episodes == 3 and told.outbox == 0)
-    assert told.policy_version == 0
-    assert told.last_kind is Kind.TUTORING
-    assert told.last_outcome == reaching.outcome.reason
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.episodes == 3 and metrics.outbox == 0)
+    assert metrics.policy_version == 0
+    assert metrics.last_kind is Kind.TUTORING
+    assert metrics.last_outcome == reaching.outcome.reason
 
     setup.trials.append(Trial(seed=1234))
     setup.publish(policy(1))
@@ -199,20 +200,22 @@ def test_it_shows_cases_plays_trials_and_practises(
     assert practice.episode.seed in PRACTICE
 
     assert setup.command(Command.PAUSE) == ["paused"]
-    paused = setup.tells(lambda told: told.paused and told.steps_per_s == 0)
+    paused = setup.wait_for_metrics(lambda metrics: metrics.paused and metrics.steps_per_s == 0)
     setup.cases.append(TutoringCase("experiment1", 0, 0))
-    assert setup.tells(lambda t: t.time_s > paused.time_s + 1).episodes == paused.episodes
+    assert (
+        setup.wait_for_metrics(lambda t: t.time_s > paused.time_s + 1).episodes == paused.episodes
+    )
     assert setup.command(Command.RESUME) == ["resumed"]
     eventually(lambda: len(setup.sequences) == 4, "it plays again")
     assert stop(setup.actor) == 0
 
 
-def test_its_policy_is_guided_where_the_learner_says(
+def test_its_policy_is_guided_in_situations_that_the_learner_requests(
     setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     situation = dict(TASK.sample(3))
     asked = Correction("experiment1", 3, situation)
-    setup.cases.append(asked)  # has no policy yet
+    setup.cases.append(asked)  # the actor has no policy yet
     setup.start_actor("--set", "tutor.guidance_deg=2")
     eventually(lambda: "no policy to be guided" in setup.log.read_text(), "a warning")
     assert {(r.run_id, r.policy_version) for r in setup.requests} == {("", 0)}
@@ -230,8 +233,8 @@ def test_its_policy_is_guided_where_the_learner_says(
     np.testing.assert_allclose(episode.targets, plan(situation), atol=1e-4)
     off = np.abs(episode.actions - episode.targets)
     assert off.max() <= 2.0 + 1e-4
-    assert off.max() > 1.0, "it is the policy that acts"
-    setup.tells(lambda told: told.outbox == 0)
+    assert off.max() > 1.0, "the actions are those of the policy"
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
 
 
 def test_a_policy_changes_between_episodes_only(
@@ -247,7 +250,7 @@ def test_a_policy_changes_between_episodes_only(
     eventually(lambda: "policy 2 cannot be used" in setup.log.read_text(), "a warning")
     setup.publish(policy(3))
     eventually(lambda: acts_with(3), "it acts with policy 3")
-    setup.publish(policy(2))  # late: a version never goes back
+    setup.publish(policy(2))  # older than 3, so it is ignored
     seen_rollouts = len(setup.rollouts)
     eventually(lambda: len(setup.rollouts) >= seen_rollouts + 2, "more episodes")
     setup.publish(policy(1, run_id="new"))  # but a new training begins at 1
@@ -262,7 +265,7 @@ def test_a_policy_changes_between_episodes_only(
     assert list(dict.fromkeys(versions)) == [("training", 1), ("training", 3), ("new", 1)]
 
 
-def test_a_killed_actor_sends_again_what_had_no_receipt(setup: ActorSetup) -> None:
+def test_a_killed_actor_sends_messages_without_receipt_again(setup: ActorSetup) -> None:
     setup.gives_receipts = False
     setup.cases.append(TutoringCase("experiment1", 5, 0))
     setup.start_actor()
@@ -275,10 +278,10 @@ def test_a_killed_actor_sends_again_what_had_no_receipt(setup: ActorSetup) -> No
     first, again = setup.sequences
     assert first.id == again.id
     assert np.array_equal(first.actions, again.actions)
-    setup.tells(lambda told: told.outbox == 0 and told.episodes == 0)
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0 and metrics.episodes == 0)
 
 
-def test_of_several_offered_policies_the_newest_is_taken(
+def test_the_newest_of_several_policies_is_used(
     setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     setup.cases.append(TutoringCase("experiment1", 5, 0))
@@ -286,26 +289,28 @@ def test_of_several_offered_policies_the_newest_is_taken(
     eventually(lambda: bool(setup.lives), "a demonstration is going on")
     setup.publish(policy(3))
     setup.publish(policy(2))
-    setup.tells(lambda told: told.policy_version > 0)
+    setup.wait_for_metrics(lambda metrics: metrics.policy_version > 0)
     eventually(lambda: len(setup.rollouts) >= 2, "it practises")
     assert {rollout.episode.policy_version for rollout in setup.rollouts} == {3}
 
 
-def test_what_is_refused_is_put_aside_and_holds_up_nothing(setup: ActorSetup) -> None:
+def test_a_refused_message_is_put_aside_and_delays_no_others(setup: ActorSetup) -> None:
     setup.refusal = "of another run"
     setup.cases.append(TutoringCase("experiment1", 5, 0))
     setup.start_actor()
-    told = setup.tells(lambda told: told.put_aside == 1)
-    assert (told.outbox, told.failed) == (0, 0)
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.put_aside == 1)
+    assert (metrics.outbox, metrics.failed) == (0, 0)
     assert [path.suffix for path in setup.outbox.glob("*/*")] == [".refused"]
     assert "was refused: of another run" in setup.log.read_text()
     setup.refusal = ""
     setup.cases.append(TutoringCase("experiment1", 6, 0))
-    setup.tells(lambda told: told.episodes == 2 and told.outbox == 0 and told.put_aside == 1)
+    setup.wait_for_metrics(
+        lambda metrics: metrics.episodes == 2 and metrics.outbox == 0 and metrics.put_aside == 1
+    )
     assert [episode.seed for episode in setup.sequences] == [5000, 6000]
 
 
-def test_messages_of_another_version_hold_up_no_others(setup: ActorSetup) -> None:
+def test_messages_of_another_version_delay_no_others(setup: ActorSetup) -> None:
     (setup.outbox / "sequences").mkdir(parents=True)
     key = setup.bus.keys.sequence("actor-1")
     header = {"key": key, "encoding": "application/msgpack;vmdnn.sequence.1"}
@@ -315,11 +320,13 @@ def test_messages_of_another_version_hold_up_no_others(setup: ActorSetup) -> Non
     setup.cases.append(TutoringCase("experiment1", 5, 0))
     setup.start_actor()
     eventually(lambda: len(setup.sequences) == 1, "the new sequence arrives")
-    setup.tells(lambda told: told.episodes == 1 and told.outbox == IN_FLIGHT + 1)
+    setup.wait_for_metrics(
+        lambda metrics: metrics.episodes == 1 and metrics.outbox == IN_FLIGHT + 1
+    )
     assert setup.bus.refused >= IN_FLIGHT
 
 
-def test_a_simulation_that_fails_is_reported_to_who_asked(
+def test_a_failed_simulation_is_reported_to_learner_and_evaluator(
     setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     situation = dict(TASK.sample(3))
@@ -345,13 +352,13 @@ def test_a_simulation_that_fails_is_reported_to_who_asked(
     assert by_kind[Kind.TRIAL].seed == 80
     for kind in (Kind.CORRECTION, Kind.TRIAL):
         assert (by_kind[kind].training, by_kind[kind].policy_version) == ("training", 4)
-    told = setup.tells(lambda told: told.outbox == 0 and told.failed == 3)
-    assert told.episodes == 1
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.outbox == 0 and metrics.failed == 3)
+    assert metrics.episodes == 1
     assert [episode.seed for episode in setup.sequences] == [5000]
     assert setup.actor.poll() is None
 
 
-def test_nothing_is_lost_while_the_hub_is_away(
+def test_nothing_is_lost_while_there_is_no_hub(
     setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     setup.publish(policy(1))
@@ -363,19 +370,19 @@ def test_nothing_is_lost_while_the_hub_is_away(
         lambda: len(list(setup.outbox.glob("*/*.message"))) >= 2, "it plays on without a hub"
     )
     setup.start_hub()
-    eventually(lambda: setup.command(Command.PAUSE) == ["paused"], "it is back")
-    told = setup.tells(lambda told: told.paused and told.outbox == 0)
+    eventually(lambda: setup.command(Command.PAUSE) == ["paused"], "it replies again")
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.paused and metrics.outbox == 0)
     arrived = {rollout.episode.id for rollout in setup.rollouts}
-    assert len(arrived) == told.episodes
+    assert len(arrived) == metrics.episodes
     assert list(setup.outbox.glob("*/*")) == []
     assert setup.actor.poll() is None
 
 
-def test_told_to_stop_it_gives_up_its_episode_and_ends_cleanly(
+def test_when_stopped_it_aborts_its_episode_and_ends_cleanly(
     setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     setup.publish(policy(1))
-    # an episode of many hours, were it not for the stop
+    # Without the stop an episode would take many hours.
     setup.start_actor("--set", "simulator.physics_period_s=0.00001")
     eventually(lambda: len(setup.lives) >= 1, "it plays")
     assert stop(setup.actor) == 0
@@ -383,7 +390,7 @@ def test_told_to_stop_it_gives_up_its_episode_and_ends_cleanly(
     assert setup.bus.present(Role.ACTOR) == set()
 
 
-def test_without_a_hub_it_says_what_to_do(tmp_path: Path) -> None:
+def test_without_a_hub_it_prints_what_to_do(tmp_path: Path) -> None:
     words = ("--connect", free_endpoint(), "--set", f"run.folder={tmp_path}")
     ended = run_vmdnn("actor", *words)
     assert ended.returncode == 2

@@ -1,4 +1,4 @@
-"""`vmdnn bench actor --json`: what it prints, not how fast this machine is."""
+"""`vmdnn bench actor --json`: its output, not the speed of this machine."""
 
 from __future__ import annotations
 

@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from actors.motion import execution_noise, interpolate_postures, minimum_jerk, ramp
+from actors.motion import (
+    execution_noise,
+    interpolate_postures,
+    minimum_jerk,
+    move_through,
+    ramp,
+)
 from proto.body import ARM, FOCUS, GRASP
 
 
@@ -29,6 +35,13 @@ def test_interpolation_passes_each_posture_at_even_spacing():
     np.testing.assert_allclose(
         interpolate_postures(postures, np.array([0.0, 0.5, 1.0])), postures, atol=1e-12
     )
+
+
+def test_a_movement_ends_at_its_last_posture_and_rests():
+    postures = [np.full(7, 1.0), np.arange(7.0), np.full(7, -2.0)]
+    movement = move_through(postures, moving=6, total=9)
+    np.testing.assert_allclose(movement[2], postures[1], atol=1e-12)
+    np.testing.assert_allclose(movement[5:], [postures[2]] * 4, atol=1e-12)
 
 
 def test_noise_is_smooth_and_seeded_and_has_the_given_amplitude():

@@ -1,4 +1,4 @@
-"""Whole episodes in real physics: what the tutor and the baselines can and cannot do."""
+"""Whole episodes in real physics, played by the tutor and the baselines."""
 
 import dataclasses
 
@@ -43,7 +43,7 @@ def test_tutor_is_precise_inside_the_ranges(physics):
     assert all(result.precise for result in results)
 
 
-def test_without_eyes_for_yaw_a_turned_object_is_shoved(physics):
+def test_a_baseline_that_ignores_yaw_pushes_a_turned_object(physics):
     for yaw in (-40.0, 40.0):
         situation = {"obstacle_x_m": -0.27, "object_y_m": 0.25, "object_yaw_deg": yaw}
         assert not outcome(physics, "yaw-blind", situation).strict
@@ -51,12 +51,12 @@ def test_without_eyes_for_yaw_a_turned_object_is_shoved(physics):
 
 
 @pytest.mark.parametrize("obstacle_x_m", [-0.32, -0.22])
-def test_without_eyes_for_the_obstacle_it_is_touched(physics, obstacle_x_m):
+def test_a_baseline_that_ignores_the_obstacle_touches_it(physics, obstacle_x_m):
     situation = {"obstacle_x_m": obstacle_x_m, "object_y_m": 0.25, "object_yaw_deg": 0.0}
     assert outcome(physics, "obstacle-blind", situation).reason == "touched_obstacle"
 
 
-def test_replay_only_works_where_it_was_recorded(physics):
+def test_replay_succeeds_only_in_the_recorded_situation(physics):
     recorded = {"obstacle_x_m": -0.27, "object_y_m": 0.25, "object_yaw_deg": 0.0}
     assert outcome(physics, "replay", recorded).precise
     assert not outcome(physics, "replay", {**recorded, "object_yaw_deg": 45.0}).strict
@@ -68,7 +68,7 @@ def test_lookup_is_the_tutor_on_the_grid(physics):
 
 
 @pytest.mark.parametrize("name", ["tutor", "lookup"])
-def test_without_an_obstacle_the_tutor_moves_as_over_the_middle_one(physics, name):
+def test_without_an_obstacle_the_tutor_moves_as_over_the_middle_obstacle(physics, name):
     situation = {"object_y_m": 0.25, "object_yaw_deg": 22.5}
     over = {**situation, "obstacle_x_m": -0.27}
     free, blocked = (
@@ -124,12 +124,12 @@ def test_noise_is_in_the_actions_and_the_clean_plan_stays_the_target(physics):
     assert np.abs(noisy.actions - noisy.targets).max() > 0.5
 
 
-def test_an_unknown_policy_lists_the_ones_there_are():
+def test_an_unknown_policy_is_refused_with_a_list_of_policies():
     with pytest.raises(UserError, match=r"tutor, replay, yaw-blind, obstacle-blind, lookup"):
         make_policy("tutr", TASK)
 
 
-def test_an_unknown_backend_lists_the_ones_there_are():
+def test_an_unknown_backend_is_refused_with_a_list_of_backends():
     for name in ("sapiens", "no.such.module:Simulator", "actors.player:Nothing"):
         with pytest.raises(UserError, match="sapien"):
             make_simulator(SimulatorConfig(backend=name))

@@ -1,9 +1,18 @@
-"""Fitting polynomials of the situation to residuals of postures."""
+"""Fitting of postures that are polynomials of the situation."""
 
 import numpy as np
 import pytest
 
-from actors.posture_fitting import CLEARANCE, fit_polynomial, linearize, shortfall
+from actors.kinematics import Arm
+from actors.posture_fitting import (
+    CLEARANCE,
+    LIMIT,
+    fit_polynomial,
+    limit_violations,
+    linearize,
+    shortfall,
+)
+from sim_assets.hand import OPEN_DEG
 
 FEATURES = np.array([[1.0, y] for y in np.linspace(-1.0, 1.0, 5)])
 ORDERS = np.array([0, 1])
@@ -38,7 +47,15 @@ def test_linearize_gives_values_jacobians_and_their_cost():
     assert cost == pytest.approx(2 * (4.0 + 9.0 + 16.0))
 
 
-def test_shortfall_counts_only_what_misses_the_margin():
+def test_postures_near_or_beyond_a_limit_have_residuals():
+    arm = Arm(OPEN_DEG, table_drop_m=0.15)
+    middle = (arm.minimum_rad + arm.maximum_rad) / 2
+    assert (limit_violations(arm, middle) == 0.0).all()
+    np.testing.assert_allclose(limit_violations(arm, arm.minimum_rad), np.ones(7))
+    np.testing.assert_allclose(limit_violations(arm, arm.maximum_rad + LIMIT), np.full(7, 2.0))
+
+
+def test_shortfall_is_zero_beyond_the_margin():
     np.testing.assert_allclose(
         shortfall(np.array([0.010, 0.004, -0.002]), 0.006),
         np.array([0.0, 0.002, 0.008]) / CLEARANCE,

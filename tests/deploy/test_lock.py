@@ -1,4 +1,4 @@
-"""The lock is complete: a fresh machine needs nothing that it does not name."""
+"""The lock is complete: it contains every package that a fresh machine needs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from services.machine.doctor import LOCK, read_lock
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
 LOCKED = read_lock(LOCK)
 REPLACED = {"opencv-python"}
-"""Asked for by sapien, and provided by opencv-python-headless."""
+"""Required by sapien, and provided by opencv-python-headless."""
 
 
 def wanted_by(package: str) -> list[Requirement]:
@@ -43,7 +43,7 @@ def test_every_requirement_is_locked_in_a_version_that_fits() -> None:
             assert Version(LOCKED[name]) in requirement.specifier, requirement
 
 
-def test_nothing_is_locked_that_nobody_asks_for() -> None:
+def test_every_locked_package_is_required() -> None:
     project = PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]
     needed = {"setuptools"}  # builds the project itself
     waiting = [canonicalize_name(Requirement(line).name) for line in project]

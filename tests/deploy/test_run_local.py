@@ -1,4 +1,4 @@
-"""The one command: what it refuses, how it stops, that a run goes on, and the whole loop."""
+"""run_local plays a whole run, refuses bad input, stops cleanly, and continues a run."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def started(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 @pytest.mark.timeout(500)  # more than its own limits together
-def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> None:
+def test_a_stopped_run_is_continued_to_its_end(tmp_path: Path) -> None:
     run = tmp_path / "smoke"
     with started(tmp_path) as process:
         eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept")
@@ -90,7 +90,7 @@ def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> N
     config = load_config(run / "config.yaml")
     assert config.run.name == "smoke"
 
-    # With another network the run cannot go on, and nothing of it is touched.
+    # With another network the run cannot be continued, and its files are not changed.
     with started(tmp_path, "--set", "network.pfc.units=7") as process:
         output, errors = process.communicate(timeout=60)
         assert process.returncode == 2, output
@@ -100,11 +100,11 @@ def test_the_whole_loop_stopped_in_between_and_gone_on_with(tmp_path: Path) -> N
     assert len(list(run.glob("policies/*.safetensors"))) == 4
 
 
-def test_a_process_that_is_given_bad_input_ends_the_run_and_says_why(tmp_path: Path) -> None:
+def test_a_process_with_bad_input_ends_the_run_with_its_message(tmp_path: Path) -> None:
     with started(tmp_path, "--backend", "nosuchsimulator") as process:
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 2
-    assert "there is no backend 'nosuchsimulator'" in errors
+    assert "there is no 'nosuchsimulator'" in errors
     assert not processes_that_name(str(tmp_path))
 
 
@@ -178,7 +178,7 @@ def state(tmp_path: Path, **given: object) -> ProcessState:
     return ProcessState(**values)  # type: ignore[arg-type]
 
 
-def test_a_crash_now_and_then_is_told_and_forgiven(tmp_path: Path) -> None:
+def test_rare_crashes_are_reported_and_do_not_end_the_run(tmp_path: Path) -> None:
     crashes = Crashes()
     assert crashes.update([state(tmp_path, started_s=0)]) == []
     for hour in range(1, 3 * TOO_MANY_CRASHES):
@@ -187,7 +187,7 @@ def test_a_crash_now_and_then_is_told_and_forgiven(tmp_path: Path) -> None:
         assert crashes.update([state(tmp_path, started_s=3600 * hour)]) == []
 
 
-def test_crashing_again_and_again_ends_the_run(tmp_path: Path) -> None:
+def test_repeated_crashes_end_the_run(tmp_path: Path) -> None:
     (tmp_path / "actor-1.log").write_text("one\nno such luck\n")
     crashes = Crashes()
     for second in range(TOO_MANY_CRASHES):

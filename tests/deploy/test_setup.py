@@ -1,4 +1,4 @@
-"""The scripts explain their arguments, and say what is missing where they may not install it."""
+"""The scripts explain their arguments, and print what is missing if they cannot install it."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_help_explains_every_option_and_sets_up_nothing(bare: Path) -> None:
 
 
 @pytest.mark.parametrize("script", ["run_local.sh", "test.sh"])
-def test_without_python_and_without_a_way_to_install_it_says_what_to_run(
+def test_without_python_and_permission_to_install_it_prints_what_to_run(
     bare: Path, script: str
 ) -> None:
     answer = call(bare / "deploy" / script, path=bare / "bin")
@@ -61,7 +61,7 @@ def test_without_python_and_without_a_way_to_install_it_says_what_to_run(
     assert "apt-get install --no-install-recommends python3 python3-venv" in answer.stderr
 
 
-def test_a_machine_that_is_set_up_is_left_alone(tmp_path: Path) -> None:
+def test_a_machine_that_is_set_up_is_not_changed(tmp_path: Path) -> None:
     stamp = DEPLOY.parent / ".venv" / "installed"
     installed_from = (DEPLOY / "requirements.lock", DEPLOY.parent / "pyproject.toml")
     digest = hashlib.sha256(b"".join(file.read_bytes() for file in installed_from)).hexdigest()
@@ -88,7 +88,7 @@ def set_up_graphics(bare: Path, *arguments: str) -> subprocess.CompletedProcess[
     )
 
 
-def test_without_a_driver_it_says_what_is_wrong_and_what_to_install(bare: Path) -> None:
+def test_without_a_driver_it_prints_the_problem_and_what_to_install(bare: Path) -> None:
     answer = set_up_graphics(bare, "--actors", "2")
     assert answer.returncode == 1
     assert "no Vulkan driver was found" in answer.stderr
@@ -99,13 +99,13 @@ def test_without_a_driver_it_says_what_is_wrong_and_what_to_install(bare: Path) 
 @pytest.mark.parametrize(
     "arguments", [("--set", "simulator.render=false"), ("--backend", "nothing")]
 )
-def test_no_driver_is_asked_for_where_none_would_help(bare: Path, arguments: list[str]) -> None:
-    """Without pictures none is needed, and run_local.py says what is wrong with its arguments."""
+def test_no_driver_is_installed_if_it_would_not_help(bare: Path, arguments: list[str]) -> None:
+    """Without rendering none is needed; run_local.py reports wrong arguments."""
     answer = set_up_graphics(bare, *arguments)
     assert (answer.returncode, answer.stderr) == (0, "")
 
 
-def test_a_backend_that_names_no_packages_has_its_say(bare: Path) -> None:
+def test_the_message_of_a_backend_without_packages_is_printed(bare: Path) -> None:
     (bare / "own_backend.py").write_text(
         "from actors.backends.sapien.simulator import SapienSimulator\n"
         "from actors.simulator import Diagnosis\n"

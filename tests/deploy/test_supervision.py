@@ -1,4 +1,4 @@
-"""What crashes comes back; what has ended for good is reported; nothing outlives its supervisor."""
+"""Crashed processes are started again, ended ones are reported, none outlives its supervisor."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def states(supervisor: Supervisor) -> dict[str, ProcessState]:
     return {process.name: process for process in supervisor.processes()}
 
 
-def test_all_run_under_their_names_and_are_gone_afterwards(tmp_path: Path) -> None:
+def test_all_programs_run_under_their_names_and_end_with_the_supervisor(tmp_path: Path) -> None:
     with Supervisor([Program("hub", SLEEP), Program("actor", SLEEP, processes=2)], tmp_path) as s:
         s.start("hub")
         s.start("actor")
@@ -40,7 +40,7 @@ def test_all_run_under_their_names_and_are_gone_afterwards(tmp_path: Path) -> No
     assert not any(is_alive(process.pid) for process in found.values())
 
 
-def test_a_killed_process_comes_back(tmp_path: Path) -> None:
+def test_a_killed_process_is_started_again(tmp_path: Path) -> None:
     with Supervisor([Program("actor", SLEEP)], tmp_path) as supervisor:
         supervisor.start("actor")
         eventually(lambda: states(supervisor)["actor"].state == "RUNNING", "the first process runs")
@@ -51,7 +51,7 @@ def test_a_killed_process_comes_back(tmp_path: Path) -> None:
         )
 
 
-def test_bad_input_is_not_tried_again(tmp_path: Path) -> None:
+def test_a_process_that_ends_with_bad_input_is_not_started_again(tmp_path: Path) -> None:
     command = (sys.executable, "-c", "import sys; print('no such thing'); sys.exit(2)")
     with Supervisor([Program("learner", command)], tmp_path) as supervisor:
         supervisor.start("learner")
@@ -70,13 +70,13 @@ def test_each_program_gets_its_own_thread_count(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["run #1", "100%"])
-def test_a_folder_that_supervisord_cannot_take_is_refused(tmp_path: Path, name: str) -> None:
+def test_a_folder_name_that_supervisord_cannot_read_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(UserError, match=name), Supervisor([], tmp_path / name):
         pass
 
 
 @pytest.mark.parametrize("deadly", [signal.SIGKILL, signal.SIGTERM])
-def test_nothing_outlives_a_supervisor_that_is_killed(tmp_path: Path, deadly: int) -> None:
+def test_no_process_outlives_a_killed_supervisor(tmp_path: Path, deadly: int) -> None:
     script = (
         "import sys, time\n"
         "from pathlib import Path\n"

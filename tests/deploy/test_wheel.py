@@ -1,4 +1,4 @@
-"""The wheel works in an environment of its own, from any folder, without the repository."""
+"""The wheel works in a new environment, from any folder, without the repository."""
 
 from __future__ import annotations
 
@@ -41,7 +41,9 @@ def vmdnn(tmp_path_factory: pytest.TempPathFactory) -> Run:
     install = ("--python", python, "install", "--no-deps", "--no-index", wheel)
     subprocess.run([*pip, *install], check=True)
     packages = Path(sysconfig.get_path("purelib", vars={"base": str(folder / "env")}))
-    (packages / "dependencies.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
+    # one line for each folder, and no line for the editable install of the repository
+    dependencies = [entry for entry in sys.path if "site-packages" in entry]
+    (packages / "dependencies.pth").write_text("\n".join(dependencies))
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
 
@@ -59,7 +61,7 @@ def vmdnn(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return run
 
 
-def test_it_knows_its_version(vmdnn: Run) -> None:
+def test_it_has_its_version(vmdnn: Run) -> None:
     assert vmdnn("--version").stdout.startswith("vmdnn 0.")
 
 
@@ -82,7 +84,7 @@ def test_an_actor_starts_with_a_built_in_configuration(vmdnn: Run) -> None:
     assert "start one with `vmdnn hub`" in ended.stderr
 
 
-def test_a_configuration_that_there_is_not_is_named(vmdnn: Run) -> None:
+def test_an_unknown_configuration_is_named(vmdnn: Run) -> None:
     ended = vmdnn("inspect", "network", "--config", "smok")
     assert ended.returncode == 2
     names = sorted(path.stem for path in (ROOT / "deploy" / "config").glob("*.yaml"))

@@ -1,9 +1,10 @@
-"""Sequences that a small training can learn: a bar is seen, and tells where to go."""
+"""Sequences for a small training: the position of a bar in the picture determines the action."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -86,3 +87,12 @@ def small_config() -> Callable[..., Config]:
         )
 
     return make
+
+
+@pytest.fixture
+def no_compiler(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A machine without a C++ compiler, on which no kernels have been compiled."""
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
+    monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")

@@ -46,7 +46,7 @@ def checkpoint() -> Checkpoint:
     return Checkpoint(metadata, tensors)
 
 
-def test_file_gives_back_what_was_saved(tmp_path: Path, checkpoint: Checkpoint) -> None:
+def test_a_saved_checkpoint_is_read_back_unchanged(tmp_path: Path, checkpoint: Checkpoint) -> None:
     path = tmp_path / "deep" / "a.safetensors"
     save_checkpoint(path, checkpoint)
     loaded = load_checkpoint(path)
@@ -57,9 +57,7 @@ def test_file_gives_back_what_was_saved(tmp_path: Path, checkpoint: Checkpoint) 
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_file_that_cannot_be_written_leaves_the_old_one(
-    tmp_path: Path, checkpoint: Checkpoint
-) -> None:
+def test_a_failed_write_keeps_the_old_checkpoint(tmp_path: Path, checkpoint: Checkpoint) -> None:
     path = tmp_path / "a.safetensors"
     save_checkpoint(path, checkpoint)
     before = path.read_bytes()

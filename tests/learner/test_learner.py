@@ -1,4 +1,4 @@
-"""The learner as a process: asks, keeps, trains, publishes, and carries on after a kill."""
+"""The learner as a process requests and stores sequences, trains, publishes, and restarts."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def case(number: int, repeat: int, task: str = "experiment1") -> TutoringCase:
 
 
 class LearnerSetup:
-    """A hub, a learner, and a session that acts as an actor."""
+    """A hub, a learner, and a session that plays the role of an actor."""
 
     def __init__(self, stack: ExitStack, folder: Path, make_episode: MakeEpisode) -> None:
         self._stack = stack
@@ -81,7 +81,7 @@ class LearnerSetup:
         self.actor = self.join("actor")
         self.actor.announce()
         self.policies: list[PolicyVersion] = []
-        self.told: LearnerMetrics | None = None
+        self.metrics: LearnerMetrics | None = None
         self._receipts: list[Receipt] = []
         keys = self.actor.keys
         self.actor.subscribe_newest(keys.policy, self.policies.append, PolicyVersion)
@@ -90,7 +90,7 @@ class LearnerSetup:
         self.process: Popen[bytes]
 
     def start(self, *more: str) -> None:
-        self.told = None
+        self.metrics = None
         self.process = self._stack.enter_context(vmdnn("learner", *self.words, *more))
 
     def join(self, name: str) -> Bus:
@@ -98,7 +98,7 @@ class LearnerSetup:
         return self._stack.enter_context(bus)
 
     def ask(self) -> list[TutoringCase | Correction]:
-        """Ask as an actor that holds the newest policy it heard of."""
+        """Send a request as an actor that has the newest policy."""
         newest = [(policy.run_id, policy.version) for policy in self.policies[-1:]]
         request = TutoringRequest("actor", *(newest[0] if newest else ("", 0)))
         key = self.actor.keys.request_tutoring
@@ -128,8 +128,8 @@ class LearnerSetup:
         }
         return self._make_episode(20, kind=Kind.CORRECTION, actor="actor", **given)
 
-    def practise_in_vain(self, seed: int) -> Correction:
-        """The policy fails in practice, so it is guided there."""
+    def fail_in_practice(self, seed: int) -> Correction:
+        """Report a failure of practice until the learner requests a correction there."""
         task, newest = make_task(TaskConfig()), self.policies[-1]
         policy = {"run_id": newest.run_id, "policy_version": newest.version, "task": task.name}
         verdict = Verdict(seed=seed, situation=task.sample(seed), outcome=FAILED, **policy)
@@ -156,11 +156,11 @@ class LearnerSetup:
         return self._make_episode(20, kind=Kind.TUTORING, actor="actor", **given)
 
     def send(self, episode: Episode) -> str:
-        """Send a sequence until it is answered; gives the refusal, empty if there is none."""
+        """Send a sequence until its receipt arrives; return the refusal, empty if accepted."""
         return self._send(episode.id, self.actor.keys.sequence("actor"), Sequence(episode))
 
     def fail(self, report: EpisodeFailed) -> str:
-        """The same with the report that a simulation failed."""
+        """Report a failed simulation until its receipt arrives; return the refusal."""
         return self._send(report.id, self.actor.keys.failure("actor"), report)
 
     def _send(self, name: str, key: str, message: object) -> str:
@@ -180,13 +180,14 @@ class LearnerSetup:
         for number in SETTINGS["learner.cases"]:  # type: ignore[attr-defined]
             assert self.send(self.episode(case(number, 0))) == ""
 
-    def tells(self, what: Callable[[LearnerMetrics], bool]) -> LearnerMetrics:
-        eventually(lambda: self.told is not None and what(self.told), "the metrics it should tell")
-        assert self.told is not None
-        return self.told
+    def wait_for_metrics(self, ready: Callable[[LearnerMetrics], bool]) -> LearnerMetrics:
+        """Wait until the newest metrics satisfy `ready`."""
+        eventually(lambda: self.metrics is not None and ready(self.metrics), "the expected metrics")
+        assert self.metrics is not None
+        return self.metrics
 
     def _listen(self, metrics: LearnerMetrics) -> None:
-        self.told = metrics
+        self.metrics = metrics
 
 
 @pytest.fixture
@@ -195,12 +196,12 @@ def setup(tmp_path: Path, make_episode: MakeEpisode) -> Iterator[LearnerSetup]:
         yield LearnerSetup(stack, tmp_path, make_episode)
 
 
-def test_it_asks_for_each_case_once_and_keeps_what_it_is_shown(setup: LearnerSetup) -> None:
+def test_it_requests_each_case_once_and_stores_the_sequences(setup: LearnerSetup) -> None:
     setup.start()
     given = [setup.ask_until_given(), *setup.ask(), *setup.ask(), *setup.ask()]
     assert given == [case(number, 0) for number in (0, 20, 44)]
-    told = setup.tells(lambda told: told.stage is Stage.WAITING)
-    assert (told.sequences, told.loss, told.policy_version) == (0, None, 0)
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.stage is Stage.WAITING)
+    assert (metrics.sequences, metrics.loss, metrics.policy_version) == (0, None, 0)
 
     episode = setup.episode(given[0])
     assert setup.send(episode) == setup.send(episode) == ""
@@ -211,7 +212,7 @@ def test_it_asks_for_each_case_once_and_keeps_what_it_is_shown(setup: LearnerSet
     assert other_task == "this run learns experiment1, not experiment9"
     practice = setup.send(replace(episode, kind=Kind.PRACTICE, id="no-demonstration"))
     assert practice == "nothing is learned from an episode of the kind practice"
-    setup.tells(lambda told: told.sequences == 1)
+    setup.wait_for_metrics(lambda metrics: metrics.sequences == 1)
     kept = list((setup.folder / "tutoring").iterdir())
     assert [path.name for path in kept] == ["case0.mcap"]
     sent = setup.episode(given[0])
@@ -225,7 +226,7 @@ def test_it_asks_for_each_case_once_and_keeps_what_it_is_shown(setup: LearnerSet
     assert stop(setup.process) == 0
 
 
-def test_pretraining_has_cases_of_its_own_and_does_not_wait_for_the_others(
+def test_pretraining_has_its_own_cases_and_does_not_wait_for_the_others(
     setup: LearnerSetup,
 ) -> None:
     asked = {"task": "reaching", "cases": "[0,14]", "repeats": 1, "epochs": 3}
@@ -235,13 +236,15 @@ def test_pretraining_has_cases_of_its_own_and_does_not_wait_for_the_others(
     assert [setup.ask_until_given(), *setup.ask(), *setup.ask()] == [first, second, case(0, 0)]
     setup.send(setup.episode(case(0, 0)))
     setup.send(setup.episode(first, id="reaching0"))
-    assert setup.tells(lambda told: told.sequences == 2).stage is Stage.WAITING
+    assert setup.wait_for_metrics(lambda metrics: metrics.sequences == 2).stage is Stage.WAITING
 
     setup.send(setup.episode(second, id="reaching14"))
     formed = pretraining_file(setup.folder)
     eventually(formed.exists, "pre-training is over")
-    told = setup.tells(lambda told: told.stage is Stage.WAITING and told.epoch == 3)
-    assert (told.epochs_total, told.sequences) == (3, 3)
+    metrics = setup.wait_for_metrics(
+        lambda metrics: metrics.stage is Stage.WAITING and metrics.epoch == 3
+    )
+    assert (metrics.epochs_total, metrics.sequences) == (3, 3)
     checkpoint = load_checkpoint(formed)
     assert checkpoint.metadata.stage is Stage.PRETRAINING
     training = checkpoint.metadata.training
@@ -250,12 +253,12 @@ def test_pretraining_has_cases_of_its_own_and_does_not_wait_for_the_others(
     assert set(training.asked) == {"object_y_m", "object_yaw_deg"}
     assert checkpoint.part("classifier.")["weight"].shape == (3 + 5, 20)
 
-    # it goes on with the others once they are there, also after a restart
+    # It continues with the other sequences when they have arrived, also after a restart.
     setup.process.kill()
     setup.process.wait()
     setup.start(*words, "--set", "learner.publish_every_epochs=400")
     setup.show_all()
-    setup.tells(lambda told: told.stage is Stage.FINISHED)
+    setup.wait_for_metrics(lambda metrics: metrics.stage is Stage.FINISHED)
     assert stop(setup.process) == 0
     kept = {path.stem for path in (setup.folder / "pretraining").iterdir()}
     assert kept == {"reaching0", "reaching14"}
@@ -263,7 +266,7 @@ def test_pretraining_has_cases_of_its_own_and_does_not_wait_for_the_others(
     assert tutored == {"case0", "case20", "case44"}
 
 
-def test_a_killed_learner_publishes_its_policy_again_and_goes_on(setup: LearnerSetup) -> None:
+def test_a_killed_learner_publishes_its_policy_again_and_continues(setup: LearnerSetup) -> None:
     setup.start()
     setup.show_all()
     eventually(lambda: len(setup.policies) >= 3, "three policies")
@@ -292,22 +295,24 @@ def test_a_killed_learner_publishes_its_policy_again_and_goes_on(setup: LearnerS
     assert versions == list(range(again.version, again.version + len(versions)))
     assert [policy.epoch for policy in setup.policies] == [5 * version for version in versions]
     assert setup.ask() == [], "everything was shown before"
-    setup.tells(lambda told: told.done and told.sequences == 3)
+    setup.wait_for_metrics(lambda metrics: metrics.done and metrics.sequences == 3)
 
 
-def test_its_policy_is_corrected_where_it_fails_and_it_learns_on(setup: LearnerSetup) -> None:
+def test_its_policy_is_corrected_where_it_fails_and_training_continues(setup: LearnerSetup) -> None:
     corrections = {"rounds": 1, "sequences": 3, "tries": 5, "epochs": 4}
     words = [f"--set=learner.corrections.{name}={value}" for name, value in corrections.items()]
     words += ["--set", "learner.epochs=6", "--set", "done.policy_versions=3"]
     setup.start(*words)
     setup.show_all()
-    told = setup.tells(lambda told: told.stage is Stage.WAITING and told.round == 1)
-    assert (told.epoch, told.epochs_total, told.policy_version) == (6, 10, 2)
-    assert (told.corrections, told.corrections_total, told.done) == (0, 3, False)
+    metrics = setup.wait_for_metrics(
+        lambda metrics: metrics.stage is Stage.WAITING and metrics.round == 1
+    )
+    assert (metrics.epoch, metrics.epochs_total, metrics.policy_version) == (6, 10, 2)
+    assert (metrics.corrections, metrics.corrections_total, metrics.done) == (0, 3, False)
     eventually(lambda: [p.epoch for p in setup.policies] == [5, 6], "the policies of the first lap")
     assert setup.ask() == [], "it knows of no failure"
 
-    first, second = setup.practise_in_vain(2**30), setup.practise_in_vain(2**30 + 1)
+    first, second = setup.fail_in_practice(2**30), setup.fail_in_practice(2**30 + 1)
     task = make_task(TaskConfig())
     assert first == Correction("experiment1", 2**30, task.sample(2**30))
     setup.send(setup.correction(first))
@@ -315,21 +320,26 @@ def test_its_policy_is_corrected_where_it_fails_and_it_learns_on(setup: LearnerS
     setup.send(setup.correction(first, id="of-another-policy", policy_version=1))
     foreign = setup.correction(second, id="of-another-training", training="before")
     assert "a policy of another training" in setup.send(foreign)
-    setup.tells(lambda told: told.corrections == 1)
+    setup.wait_for_metrics(lambda metrics: metrics.corrections == 1)
 
     # what was asked for and shown before is not forgotten
     setup.process.kill()
     setup.process.wait()
     setup.policies.clear()
     setup.start(*words)
-    told = setup.tells(lambda told: told.stage is Stage.WAITING)
-    assert (told.corrections, told.sequences) == (1, 4)
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.stage is Stage.WAITING)
+    assert (metrics.corrections, metrics.sequences) == (1, 4)
     eventually(lambda: [p.version for p in setup.policies] == [2], "the newest policy again")
     setup.send(setup.correction(second))
-    setup.send(setup.correction(setup.practise_in_vain(2**30 + 2)))
+    setup.send(setup.correction(setup.fail_in_practice(2**30 + 2)))
 
-    told = setup.tells(lambda told: told.stage is Stage.FINISHED)
-    assert (told.epoch, told.sequences, told.policy_version, told.done) == (10, 6, 3, True)
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.stage is Stage.FINISHED)
+    assert (metrics.epoch, metrics.sequences, metrics.policy_version, metrics.done) == (
+        10,
+        6,
+        3,
+        True,
+    )
     eventually(lambda: setup.policies[-1].version == 3, "a policy of the round")
     metadata = checkpoint_from_bytes(setup.policies[-1].weights, "").metadata
     assert (metadata.epoch, metadata.cases, metadata.sequences) == (10, 6, 6)
@@ -337,7 +347,7 @@ def test_its_policy_is_corrected_where_it_fails_and_it_learns_on(setup: LearnerS
     assert stop(setup.process) == 0
 
 
-def test_what_cannot_be_simulated_is_given_up_and_not_waited_for(
+def test_cases_that_cannot_be_simulated_are_given_up(
     setup: LearnerSetup, failure: Callable[..., EpisodeFailed]
 ) -> None:
     setup.start()
@@ -349,10 +359,10 @@ def test_what_cannot_be_simulated_is_given_up_and_not_waited_for(
         assert setup.fail(report) == setup.fail(report) == ""
     assert setup.ask() == []
     setup.send(setup.episode(case(0, 0)))
-    assert setup.tells(lambda told: told.sequences == 1).stage is Stage.WAITING
+    assert setup.wait_for_metrics(lambda metrics: metrics.sequences == 1).stage is Stage.WAITING
     setup.send(setup.episode(case(20, 0)))
-    told = setup.tells(lambda told: told.stage is not Stage.WAITING)
-    assert (told.given_up, told.sequences) == (1, 2)
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.stage is not Stage.WAITING)
+    assert (metrics.given_up, metrics.sequences) == (1, 2)
 
 
 def test_corrections_of_an_earlier_training_do_not_count(setup: LearnerSetup) -> None:
@@ -361,51 +371,55 @@ def test_corrections_of_an_earlier_training_do_not_count(setup: LearnerSetup) ->
     words += ["--set", "learner.epochs=5"]
     setup.start(*words)
     setup.show_all()
-    setup.tells(lambda told: told.stage is Stage.WAITING and told.round == 1)
+    setup.wait_for_metrics(lambda metrics: metrics.stage is Stage.WAITING and metrics.round == 1)
     eventually(lambda: bool(setup.policies), "the policy")
-    setup.send(setup.correction(setup.practise_in_vain(2**30)))
-    setup.tells(lambda told: told.stage is Stage.COUPLED and told.round == 1)
+    setup.send(setup.correction(setup.fail_in_practice(2**30)))
+    setup.wait_for_metrics(lambda metrics: metrics.stage is Stage.COUPLED and metrics.round == 1)
     setup.process.kill()
     setup.process.wait()
     shutil.rmtree(setup.folder / "checkpoints")
     setup.policies.clear()
     setup.start(*words)
-    told = setup.tells(lambda told: told.stage is Stage.WAITING and told.round == 1)
-    assert (told.policy_version, told.corrections, told.sequences) == (1, 0, 4)
+    metrics = setup.wait_for_metrics(
+        lambda metrics: metrics.stage is Stage.WAITING and metrics.round == 1
+    )
+    assert (metrics.policy_version, metrics.corrections, metrics.sequences) == (1, 0, 4)
 
 
-def test_it_obeys_and_a_clean_stop_loses_no_epoch(setup: LearnerSetup) -> None:
+def test_it_obeys_commands_and_a_clean_stop_loses_no_epoch(setup: LearnerSetup) -> None:
     setup.start("--set", "learner.epochs=1000000", "--set", "learner.publish_every_epochs=1000")
     setup.show_all()
-    setup.tells(lambda told: told.stage is Stage.COUPLED and told.epoch > 0)
+    setup.wait_for_metrics(lambda metrics: metrics.stage is Stage.COUPLED and metrics.epoch > 0)
 
-    def tell(command: Command) -> str:
+    def send_command(command: Command) -> str:
         control = setup.actor.keys.control(Role.LEARNER)
         replies = setup.actor.ask(control, Control(command), ControlReply, timeout_s=20.0)
         return " ".join(reply.note for reply in replies)
 
-    assert tell(Command.PAUSE) == "paused"
-    paused = setup.tells(lambda told: told.paused and told.epochs_per_s == 0)
-    assert setup.tells(lambda told: told.time_s > paused.time_s).epoch == paused.epoch
+    assert send_command(Command.PAUSE) == "paused"
+    paused = setup.wait_for_metrics(lambda metrics: metrics.paused and metrics.epochs_per_s == 0)
+    assert (
+        setup.wait_for_metrics(lambda metrics: metrics.time_s > paused.time_s).epoch == paused.epoch
+    )
     checkpoint = setup.folder / "checkpoints" / "training.safetensors"
-    assert tell(Command.CHECKPOINT) == f"saved coupled epoch {paused.epoch} to {checkpoint}"
-    tell(Command.RESUME)
-    setup.tells(lambda told: told.epoch > paused.epoch)
+    assert send_command(Command.CHECKPOINT) == f"saved coupled epoch {paused.epoch} to {checkpoint}"
+    send_command(Command.RESUME)
+    setup.wait_for_metrics(lambda metrics: metrics.epoch > paused.epoch)
     assert stop(setup.process) == 0
-    last = setup.told
+    last = setup.metrics
     assert last is not None
     assert load_checkpoint(checkpoint).metadata.epoch >= last.epoch
 
 
-def test_the_last_epoch_gives_a_policy_that_another_network_does_not_overwrite(
+def test_a_finished_policy_is_not_overwritten_by_another_network(
     setup: LearnerSetup,
 ) -> None:
     setup.start("--set", "learner.epochs=8")
     setup.show_all()
-    told = setup.tells(lambda told: told.stage is Stage.FINISHED)
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.stage is Stage.FINISHED)
     eventually(lambda: [p.epoch for p in setup.policies] == [5, 8], "two policies")
-    assert (told.epoch, told.epochs_total, told.policy_version) == (8, 8, 2)
-    assert not told.done, "the configuration asks for three versions"
+    assert (metrics.epoch, metrics.epochs_total, metrics.policy_version) == (8, 8, 2)
+    assert not metrics.done, "the configuration asks for three versions"
     assert stop(setup.process) == 0
 
     checkpoint = setup.folder / "checkpoints" / "training.safetensors"
@@ -417,7 +431,7 @@ def test_the_last_epoch_gives_a_policy_that_another_network_does_not_overwrite(
     assert checkpoint.read_bytes() == before
 
 
-def test_a_wrong_case_is_said_before_anything_starts(setup: LearnerSetup) -> None:
+def test_a_wrong_case_is_refused_at_the_start(setup: LearnerSetup) -> None:
     ended = run_vmdnn("learner", *setup.words, "--set", "learner.cases=[45]")
     assert ended.returncode == 2
     assert "learner.cases: there is no case 45" in ended.stderr

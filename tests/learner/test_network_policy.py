@@ -35,7 +35,7 @@ def trainer(
     return trainer
 
 
-def test_acts_as_the_trained_network_would(
+def test_acts_as_the_trained_network(
     trainer: Trainer, bar_episodes: Callable[..., Sequence[Episode]]
 ) -> None:
     trainer.epoch()
@@ -56,14 +56,14 @@ def test_acts_as_the_trained_network_would(
             assert policy.outputs.dtype == np.float32
 
 
-def test_actions_are_within_what_the_robot_accepts(trainer: Trainer) -> None:
+def test_actions_are_within_the_robots_limits(trainer: Trainer) -> None:
     trainer.epoch()
     with torch.no_grad():
         trainer.recipe.network.outputs.bias.view(11, 10)[:, -1] = 100  # all on the last unit
     policy = NetworkPolicy.from_bytes(trainer.policy_bytes(1))
     action = policy.step(np.zeros((48, 64), np.uint8))
-    for value, told in zip(ACTION_VALUES, action, strict=True):
-        assert value.minimum <= told <= value.maximum
+    for value, number in zip(ACTION_VALUES, action, strict=True):
+        assert value.minimum <= number <= value.maximum
 
 
 def test_policy_and_training_checkpoint_both_act(trainer: Trainer, tmp_path: Path) -> None:

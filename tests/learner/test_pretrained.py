@@ -8,7 +8,7 @@ from learner.pretrained import PREFIX, checkpoint_path, pretrained_names
 from proto.errors import UserError
 
 
-def test_what_comes_with_the_package_can_act() -> None:
+def test_the_pretrained_networks_can_act() -> None:
     assert f"{PREFIX}experiment1" in pretrained_names()
     for name in pretrained_names():
         checkpoint = load_checkpoint(name)
@@ -17,6 +17,6 @@ def test_what_comes_with_the_package_can_act() -> None:
         assert checkpoint_path(name).stat().st_size < 200_000
 
 
-def test_a_wrong_name_lists_those_there_are() -> None:
+def test_a_wrong_name_is_refused_with_a_list_of_names() -> None:
     with pytest.raises(UserError, match=r"no policy pretrained:dance.*pretrained:experiment1"):
         load_checkpoint(f"{PREFIX}dance")

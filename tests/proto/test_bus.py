@@ -1,4 +1,4 @@
-"""The bus between real sessions, through a real hub in a process of its own."""
+"""The bus between real sessions, through a real hub in another process."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def matched(bus: Bus, key: str) -> None:
     with_publisher.undeclare()
 
 
-def test_messages_arrive_in_order_whole_and_once(shared: Network) -> None:
+def test_messages_arrive_in_order_complete_and_once(shared: Network) -> None:
     sender, reader = shared.join(Role.LEARNER, "l"), shared.join(Role.ACTOR, "in-order")
     inbox = reader.inbox(KEYS.receipt("in-order"), Receipt, capacity=200)
     matched(sender, KEYS.receipt("in-order"))
@@ -113,7 +113,7 @@ def test_a_full_inbox_drops_the_oldest_and_says_so(shared: Network) -> None:
     assert inbox.take() == Receipt("episode-7")
 
 
-def test_a_bad_message_is_counted_logged_once_and_harms_nothing(
+def test_an_invalid_message_is_counted_and_logged_once_and_dropped(
     shared: Network, caplog: pytest.LogCaptureFixture
 ) -> None:
     key = KEYS.receipt("guarded")
@@ -141,7 +141,7 @@ def test_a_bad_message_is_counted_logged_once_and_harms_nothing(
     assert all("encoding: expected application/msgpack;vmdnn.receipt.2" in line for line in logged)
 
 
-def test_a_payload_that_changed_on_its_way_is_refused(shared: Network) -> None:
+def test_a_corrupted_payload_is_refused(shared: Network) -> None:
     key = KEYS.receipt("digest")
     reader, stranger = shared.join(Role.ACTOR, "digest"), shared.stranger()
     inbox = reader.inbox(key, Receipt, capacity=5)
@@ -168,7 +168,7 @@ def test_a_callback_that_fails_does_not_end_the_subscription(shared: Network) ->
     eventually(lambda: len(received) == 2, "the second message")
 
 
-def test_questions_are_answered_with_a_message_or_with_nothing(shared: Network) -> None:
+def test_a_query_is_answered_with_a_message_or_with_nothing(shared: Network) -> None:
     learner, actor = shared.join(Role.LEARNER, "asked"), shared.join(Role.ACTOR, "asking")
     cases = [TutoringCase("experiment1", 3, 1)]
 
@@ -191,7 +191,7 @@ def test_questions_are_answered_with_a_message_or_with_nothing(shared: Network) 
     assert learner.refused == 1
 
 
-def test_nobody_to_ask_is_no_answer_at_once(shared: Network) -> None:
+def test_a_query_without_receiver_returns_at_once_without_answers(shared: Network) -> None:
     actor = shared.join(Role.ACTOR, "lonely")
     answers: list[list[TutoringCase]] = []
 
@@ -222,7 +222,7 @@ def test_the_newest_policy_reaches_late_joiners_only_once() -> None:
         eventually(lambda: seen["late"] == [3], "the newest for who comes late")
 
 
-def test_everything_comes_back_after_the_hub_was_killed() -> None:
+def test_everything_reconnects_after_the_hub_was_killed() -> None:
     with network() as net:
         learner, actor = net.join(Role.LEARNER, "learner"), net.join(Role.ACTOR, "actor")
         versions: list[int] = []
@@ -246,7 +246,7 @@ def test_everything_comes_back_after_the_hub_was_killed() -> None:
         assert answers() == []
         learner.publish_newest(KEYS.policy, policy(2))  # into the void
         net.start_hub()
-        eventually(lambda: presence[-1] == ("actor", True), "the actor is back")
+        eventually(lambda: presence[-1] == ("actor", True), "the actor is present again")
         eventually(lambda: versions[-1] == 2, "what was published without a hub arrives")
         eventually(lambda: answers() != [], "questions are answered again")
 
@@ -263,7 +263,7 @@ def test_presence_ends_with_the_process(shared: Network) -> None:
     assert watcher.present(Role.RECORDER) == set()
 
 
-def test_without_a_hub_a_process_says_what_to_do() -> None:
+def test_without_a_hub_the_error_says_what_to_do() -> None:
     endpoint = free_endpoint()
     with pytest.raises(
         UserError, match=f"no hub answers at {endpoint}: start one with `vmdnn hub`"
@@ -271,7 +271,7 @@ def test_without_a_hub_a_process_says_what_to_do() -> None:
         open_bus(HubConfig(endpoint=endpoint), "test", Role.ACTOR, "actor")
 
 
-def test_a_taken_port_says_what_to_do(shared: Network) -> None:
+def test_for_a_port_in_use_the_error_says_what_to_do(shared: Network) -> None:
     with pytest.raises(UserError, match=r"Address already in use.*another port"):
         open_hub(HubConfig(endpoint=shared.endpoint), "test", "second")
     ended = run_vmdnn("hub", "--connect", shared.endpoint)
@@ -280,7 +280,7 @@ def test_a_taken_port_says_what_to_do(shared: Network) -> None:
     assert "Traceback" not in ended.stderr
 
 
-def test_a_hub_that_is_told_to_stop_ends_cleanly() -> None:
+def test_a_stopped_hub_ends_cleanly() -> None:
     with network() as net:
         net.join(Role.ACTOR, "actor")
         assert stop(net.hub) == 0
@@ -298,7 +298,7 @@ def test_large_messages_go_through_shared_memory_too(shared: Network) -> None:
         assert inbox.take(timeout_s=10.0) == policy(1)
 
 
-def test_a_stranger_may_control_with_plain_json(shared: Network) -> None:
+def test_any_zenoh_client_can_send_commands_as_plain_json(shared: Network) -> None:
     bus, stranger = shared.join(Role.RECORDER, "obedient"), shared.stranger()
     heard: list[Control] = []
 

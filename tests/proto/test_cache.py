@@ -1,4 +1,4 @@
-"""Where what can be built again is kept."""
+"""The folder of the cache."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_the_cache_folder_comes_from_the_environment(
 
 
 @pytest.mark.parametrize("value", [None, ""])
-def test_without_it_the_cache_lies_in_the_home_folder(
+def test_by_default_the_cache_is_in_the_home_folder(
     value: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))

@@ -1,4 +1,4 @@
-"""Messages come back as they were sent, and what is wrong is refused by name."""
+"""Messages are decoded unchanged, and an invalid field is refused by name."""
 
 from __future__ import annotations
 
@@ -90,13 +90,13 @@ def refusal(wire: Wire) -> MessageError | None:
 
 
 @given(MESSAGES)
-def test_a_message_comes_back_as_it_was(sent: Any) -> None:
+def test_a_message_is_decoded_unchanged(sent: Any) -> None:
     assert decode(encode(sent), type(sent)) == sent
 
 
 @given(steps=st.integers(1, 30), with_outputs=st.booleans())
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20)
-def test_a_whole_episode_comes_back_as_it_was(
+def test_a_whole_episode_is_decoded_unchanged(
     make_episode: MakeEpisode, steps: int, with_outputs: bool
 ) -> None:
     episode = make_episode(steps=steps, kind=Kind.TRIAL)
@@ -106,7 +106,7 @@ def test_a_whole_episode_comes_back_as_it_was(
     received.episode.images[0, 0, 0] = 7  # arrays belong to whoever received them
 
 
-def test_states_come_back_and_are_not_sent_where_there_are_none(sequence: Sequence) -> None:
+def test_states_are_decoded_unchanged_and_missing_states_are_not_sent(sequence: Sequence) -> None:
     """So that programs from before there were states understand the others."""
     random = np.random.default_rng(1)
     states = {name: random.random((3, units), np.float32) for name, units in (("a", 5), ("b", 2))}
@@ -120,7 +120,7 @@ def test_states_come_back_and_are_not_sent_where_there_are_none(sequence: Sequen
     assert decode(encode(sequence), Sequence).episode.states is None
 
 
-def test_a_live_step_comes_back_as_it_was() -> None:
+def test_a_live_step_is_decoded_unchanged() -> None:
     random = np.random.default_rng(1)
     sent = Live(
         actor="a-1",
@@ -160,7 +160,7 @@ def test_a_damaged_message_is_refused_or_still_valid(sequence: Sequence, data: A
 
 
 @given(st.binary(max_size=200))
-def test_noise_is_refused(payload: bytes) -> None:
+def test_random_bytes_are_refused(payload: bytes) -> None:
     for made in (Sequence, Control, ActorMetrics):
         with pytest.raises(MessageError):
             decode(Wire(schema_of(made).encoding, payload), made)
@@ -221,7 +221,7 @@ def test_a_field_of_another_kind_is_refused_by_name(
         ),
     ],
 )
-def test_what_is_wrong_is_named(
+def test_the_problem_is_named(
     sequence: Sequence, change: Callable[[dict[str, Any]], Any], field: str, problem: str
 ) -> None:
     wire = encode(sequence)
@@ -233,13 +233,13 @@ def test_what_is_wrong_is_named(
     assert problem in raised.value.problem
 
 
-def test_the_sender_hears_of_its_own_mistake(sequence: Sequence) -> None:
+def test_the_sender_refuses_an_invalid_message(sequence: Sequence) -> None:
     wrong = replace(sequence.episode, images=sequence.episode.images[:, :, :32])
     with pytest.raises(MessageError, match=r"episode.images: expected shape \[T, 48, 64\]"):
         encode(Sequence(wrong))
 
 
-def test_without_its_check_a_mistake_is_refused_by_the_reader(sequence: Sequence) -> None:
+def test_an_unchecked_invalid_message_is_refused_by_the_receiver(sequence: Sequence) -> None:
     assert encode(sequence, check=False) == encode(sequence)
     wrong = replace(sequence, episode=replace(sequence.episode, seed=-1))
     with pytest.raises(MessageError, match=r"episode\.seed"):
@@ -265,7 +265,7 @@ def test_a_message_that_is_too_large_is_refused_before_it_is_read() -> None:
         decode(Wire(wire.encoding, wire.payload + bytes(70_000)), Receipt)
 
 
-def test_metrics_are_json_that_anyone_reads() -> None:
+def test_metrics_are_plain_json() -> None:
     rate = Success(3, 0.75, (0.3, 0.95))
     sent = EvaluatorMetrics(
         id="evaluator",
@@ -287,7 +287,7 @@ def test_metrics_are_json_that_anyone_reads() -> None:
     assert decode(wire, *METRICS) == sent
 
 
-def test_a_field_without_a_check_is_a_mistake_of_the_program() -> None:
+def test_a_field_without_a_check_raises_type_error() -> None:
     @dataclass(frozen=True)
     class Careless:
         values: list[int]

@@ -1,4 +1,4 @@
-"""A config is checked whole, a bad one is explained, and what is saved is read back the same."""
+"""Every value of a config is checked, errors are explained, saved configs are read unchanged."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def written(folder: Path, text: str) -> Path:
         ("run: {folder: ~nobody-of-this-name/runs}", "~ cannot be expanded"),
     ],
 )
-def test_what_is_wrong_is_named(
+def test_the_problem_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
 ) -> None:
     path = written(tmp_path, text)
@@ -86,7 +86,7 @@ def test_an_override_wins_over_the_file(tmp_path: Path) -> None:
     seed=st.integers(0, 2**32 - 1),
     cases=st.none() | st.lists(st.integers(0, 44), min_size=1).map(tuple),
 )
-def test_what_is_saved_is_read_back_the_same(
+def test_a_saved_config_is_read_back_unchanged(
     tmp_path_factory: pytest.TempPathFactory,
     rate: float,
     seed: int,
@@ -102,14 +102,14 @@ def test_what_is_saved_is_read_back_the_same(
     assert again.digest() == config.digest()
 
 
-def test_the_digest_tells_what_matters_from_what_does_not() -> None:
+def test_the_digest_ignores_the_hub_and_the_folder() -> None:
     digest = Config().digest()
     assert Config(run=RunConfig(folder=Path("elsewhere"))).digest() == digest
     assert Config(run=RunConfig(seed=2)).digest() != digest
 
 
 @pytest.mark.parametrize("name", ["2024", "007", "on", "1e3", "v1.10", "2024-01-01", "1_000"])
-def test_a_name_is_the_text_that_was_written(tmp_path: Path, name: str) -> None:
+def test_a_name_is_kept_as_written(tmp_path: Path, name: str) -> None:
     path = written(tmp_path, f"run: {{name: {name}}}")
     config = load_config(path)
     assert config.run.name == name
@@ -118,7 +118,7 @@ def test_a_name_is_the_text_that_was_written(tmp_path: Path, name: str) -> None:
     assert load_config(path) == config
 
 
-def test_numbers_are_read_as_yaml_1_2_says(tmp_path: Path) -> None:
+def test_numbers_are_read_as_in_yaml_1_2(tmp_path: Path) -> None:
     text = "learner: {rate: 1e-3, epochs: 010, warmup_epochs: 0x10}\nsimulator: {backend: 12:30:45}"
     config = load_config(written(tmp_path, text), ["learner.batch=010", "learner.clip_norm=2E-1"])
     learner = config.learner
@@ -144,7 +144,7 @@ def test_a_folder_may_start_at_home(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("seed", ["-1", "4294967296", "one", "1.0", "\u0663"])
 @pytest.mark.parametrize("words", ["evaluate --policy=tutor --seed", "tutor --out=x --seed"])
-def test_a_seed_that_cannot_be_is_refused(
+def test_an_invalid_seed_is_refused(
     capsys: pytest.CaptureFixture[str], words: str, seed: str
 ) -> None:
     *command, option = words.split()

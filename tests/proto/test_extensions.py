@@ -1,4 +1,4 @@
-"""A class of the user's own is found by its name, and what is wrong with it is said."""
+"""A user's class is found by its name, and problems with it are reported."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_the_current_folder_hides_no_installed_module(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["plane", "", ":Class", "module:", ".module:Class", "a b:Class"])
-def test_a_name_that_is_none_lists_the_built_in_ones(name: str) -> None:
+def test_an_invalid_name_is_refused_with_a_list_of_built_in_names(name: str) -> None:
     with pytest.raises(UserError, match=r"simulator\.backend: there is no .*other, plain.*:Class"):
         load(name)
 
@@ -73,7 +73,7 @@ def test_a_module_without_the_class_is_named(name: str) -> None:
         ("class Mine\n", "SyntaxError: expected ':' (broken.py, line 1)"),
     ],
 )
-def test_a_module_that_fails_while_it_is_imported_says_so(
+def test_an_error_in_the_import_of_a_module_is_reported(
     folder: Path, text: str, message: str
 ) -> None:
     (folder / "broken.py").write_text(text)
@@ -84,7 +84,7 @@ def test_a_module_that_fails_while_it_is_imported_says_so(
     assert "cannot be found" not in str(caught.value)
 
 
-def test_an_incomplete_class_is_refused_with_what_it_lacks(folder: Path) -> None:
+def test_an_incomplete_class_is_refused_with_its_missing_methods(folder: Path) -> None:
     (folder / "half.py").write_text(
         "from abc import abstractmethod\n"
         "from typing import Protocol\n"

@@ -1,4 +1,4 @@
-"""Work is given to one at a time, and again when whoever has it is gone."""
+"""Work has one holder at a time, and is assigned again when its holder is gone."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class Clock:
         return self.now_s
 
 
-def test_everyone_gets_something_else() -> None:
+def test_each_holder_gets_different_work() -> None:
     leases: Leases[int] = Leases(10.0, Clock())
     assert [leases.take(name, [1, 2]) for name in ("a", "b", "c")] == [1, 2, None]
     assert len(leases) == 2
 
 
-def test_a_lease_ends_with_its_time_its_holder_or_its_work() -> None:
+def test_a_lease_ends_when_time_holder_or_work_ends() -> None:
     clock = Clock()
     leases: Leases[int] = Leases(10.0, clock)
     assert leases.take("a", [1]) == 1
@@ -47,7 +47,7 @@ def test_a_lease_ends_with_its_time_its_holder_or_its_work() -> None:
         )
     )
 )
-def test_nothing_is_ever_held_twice(happenings: list[tuple[str, object]]) -> None:
+def test_no_work_has_two_holders(happenings: list[tuple[str, object]]) -> None:
     clock = Clock()
     leases: Leases[int] = Leases(10.0, clock)
     held: dict[int, tuple[object, float]] = {}

@@ -1,4 +1,4 @@
-"""A process on the bus is present, publishes metrics and obeys; some roles exist only once."""
+"""A process on the bus is present, publishes metrics and obeys; some roles allow one process."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class IdleProcess:
         return f"saved {self.saved}"
 
 
-def test_a_participant_is_present_publishes_metrics_and_obeys() -> None:
+def test_a_participant_is_present_publishes_metrics_and_obeys_commands() -> None:
     endpoint = free_endpoint()
     config = HubConfig(endpoint=endpoint)
     with (
@@ -45,19 +45,21 @@ def test_a_participant_is_present_publishes_metrics_and_obeys() -> None:
         watcher.subscribe(watcher.keys.metrics(Role.RECORDER), heard.append, *METRICS)
         lifecycle = Lifecycle()
 
-        def tell(command: Command) -> list[ControlReply]:
+        def send_command(command: Command) -> list[ControlReply]:
             return watcher.ask(watcher.keys.control(Role.RECORDER), Control(command), ControlReply)
 
         with membership(bus, IdleProcess(bus), lifecycle):
             eventually(lambda: watcher.present(Role.RECORDER) == {"idle"}, "it is present")
             eventually(lambda: len(heard) >= 2, "it publishes metrics again and again")
-            assert tell(Command.CHECKPOINT) == [ControlReply(Role.RECORDER, "idle", "saved 1")]
-            tell(Command.PAUSE)
+            assert send_command(Command.CHECKPOINT) == [
+                ControlReply(Role.RECORDER, "idle", "saved 1")
+            ]
+            send_command(Command.PAUSE)
             assert lifecycle.paused
-            tell(Command.RESUME)
+            send_command(Command.RESUME)
             assert not lifecycle.paused
             assert not lifecycle.stopping
-            assert tell(Command.STOP)[0].note == "stopping"
+            assert send_command(Command.STOP)[0].note == "stopping"
             assert lifecycle.stopping
 
 

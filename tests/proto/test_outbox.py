@@ -1,4 +1,4 @@
-"""What is in the outbox arrives, is refused, or stays; nothing holds up the rest."""
+"""A message in the outbox arrives, is refused, or stays, and never delays the others."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def suffixes(folder: Path) -> list[str]:
     return sorted(path.suffix for path in folder.iterdir())
 
 
-def test_what_is_added_is_on_disk_before_it_is_sent(tmp_path: Path) -> None:
+def test_a_message_is_on_disk_before_it_is_sent(tmp_path: Path) -> None:
     def look(_key: str, _wire: Wire) -> None:
         seen.append(suffixes(tmp_path))
 
@@ -76,7 +76,7 @@ def test_what_is_added_is_on_disk_before_it_is_sent(tmp_path: Path) -> None:
     assert seen == [[".message"]]
 
 
-def test_it_is_sent_again_later_each_time_until_its_receipt_comes(
+def test_a_message_is_sent_again_at_growing_intervals_until_its_receipt_arrives(
     outbox: Outbox, link: Link, clock: Clock, tmp_path: Path
 ) -> None:
     outbox.add("a", "key/of/a", wire("content\n\x00of a"))
@@ -99,7 +99,9 @@ def test_it_is_sent_again_later_each_time_until_its_receipt_comes(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_new_process_finds_what_the_old_one_left_in_order(tmp_path: Path, link: Link) -> None:
+def test_a_new_process_sends_the_messages_of_the_old_one_in_order(
+    tmp_path: Path, link: Link
+) -> None:
     old = Outbox(tmp_path, Link())
     for name in "abc":
         old.add(f"episode-{name}", "key", wire(name))
@@ -114,7 +116,7 @@ def test_a_new_process_finds_what_the_old_one_left_in_order(tmp_path: Path, link
     assert len(Outbox(tmp_path, Link())) == 1
 
 
-def test_the_oldest_go_first_and_not_all_at_once(outbox: Outbox, link: Link) -> None:
+def test_the_oldest_messages_are_sent_first_and_not_all_at_once(outbox: Outbox, link: Link) -> None:
     names = fill(outbox, "m", IN_FLIGHT + 3)
     assert link.take() == names[:IN_FLIGHT]
     outbox.received(names[0])
@@ -122,9 +124,7 @@ def test_the_oldest_go_first_and_not_all_at_once(outbox: Outbox, link: Link) -> 
     assert link.take() == [names[IN_FLIGHT]], "an answer makes room for the next"
 
 
-def test_messages_that_nobody_answers_hold_up_no_others(
-    outbox: Outbox, link: Link, clock: Clock
-) -> None:
+def test_messages_without_receipt_delay_no_others(outbox: Outbox, link: Link, clock: Clock) -> None:
     unanswered = fill(outbox, "unanswered", IN_FLIGHT)
     good = fill(outbox, "good", 2)
     assert link.take() == unanswered
@@ -153,7 +153,7 @@ def test_messages_that_nobody_answers_hold_up_no_others(
     assert len(outbox) == IN_FLIGHT + 1
 
 
-def test_when_the_receiver_is_back_everything_is_sent_soon(
+def test_when_the_receiver_returns_all_messages_are_sent_soon(
     outbox: Outbox, link: Link, clock: Clock
 ) -> None:
     names = fill(outbox, "m", 3)
@@ -167,7 +167,7 @@ def test_when_the_receiver_is_back_everything_is_sent_soon(
     assert link.take() == [names[0], names[2]]
 
 
-def test_what_is_refused_is_put_aside_and_never_sent_again(
+def test_a_refused_message_is_put_aside_and_never_sent_again(
     outbox: Outbox, link: Link, clock: Clock, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     refused = fill(outbox, "refused", IN_FLIGHT)

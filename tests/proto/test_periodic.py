@@ -1,4 +1,4 @@
-"""A repeated action survives its failures and ends with its context."""
+"""A repeated action continues after failures and ends with its context."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from processes import PATIENCE_S
 from proto.periodic import every
 
 
-def test_a_repeated_action_goes_on_after_a_failure_and_ends_with_the_context() -> None:
+def test_a_repeated_action_continues_after_a_failure_and_ends_with_the_context() -> None:
     calls = 0
     third = threading.Event()
 

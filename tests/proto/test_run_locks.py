@@ -1,4 +1,4 @@
-"""Ids are never shared, and the lock of a dead process is free."""
+"""Each id has one process, and the lock of a dead process is free."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_ids_are_free_names_of_this_host(tmp_path: Path) -> None:
         assert again == first
 
 
-def test_a_wanted_id_is_refused_while_it_is_taken(tmp_path: Path) -> None:
+def test_a_requested_id_is_refused_while_it_is_used(tmp_path: Path) -> None:
     with own_id(tmp_path, Role.ACTOR, "a") as taken:
         assert taken == "a"
         refused = pytest.raises(UserError, match="an actor with the id 'a' already works")
@@ -55,7 +55,7 @@ def test_a_killed_process_frees_its_id(tmp_path: Path) -> None:
         pass
 
 
-def test_a_single_process_has_the_folder_to_itself_whatever_its_id(tmp_path: Path) -> None:
+def test_a_single_process_locks_the_folder_whatever_its_id(tmp_path: Path) -> None:
     with single_process(tmp_path, Role.LEARNER, None) as name:
         assert name == "learner"
         refused = pytest.raises(UserError, match=r"a learner .* already works in")

@@ -1,4 +1,4 @@
-"""A file is whole or not there, an appended line is on disk, and a full disk is explained."""
+"""Files are written completely or not at all, lines are synced, a full disk is reported."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def tiny_disk(tmp_path: Path) -> Iterator[Path]:
         subprocess.run(("umount", str(place)), check=True)
 
 
-def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
+def test_a_file_is_complete_or_unchanged(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "file"
     write(path, b"first")
     with pytest.raises(TypeError), written_whole(path) as stream:
@@ -88,7 +88,7 @@ def test_files_lines_and_folders_are_synced(tmp_path: Path, synced: list[str]) -
     assert synced == [str(tmp_path)]
 
 
-def test_a_line_that_was_not_finished_is_dropped(tmp_path: Path) -> None:
+def test_an_incomplete_last_line_is_dropped(tmp_path: Path) -> None:
     path = tmp_path / "log" / "lines"
     assert not drop_unfinished_line(path)
     append_line(path, b"one\n")
@@ -100,7 +100,7 @@ def test_a_line_that_was_not_finished_is_dropped(tmp_path: Path) -> None:
     assert path.read_bytes() == b"one\ntwo\n"
 
 
-def test_a_full_disk_is_named_and_leaves_things_as_they_were(tiny_disk: Path) -> None:
+def test_a_full_disk_is_reported_and_changes_nothing(tiny_disk: Path) -> None:
     log, file = tiny_disk / "log", tiny_disk / "file"
     append_line(log, b"one\n")
     write(file, b"small")
@@ -117,7 +117,7 @@ def test_a_full_disk_is_named_and_leaves_things_as_they_were(tiny_disk: Path) ->
 @pytest.mark.parametrize(
     ("number", "said"), [(errno.ENOSPC, "is full"), (errno.EDQUOT, "quota on the file system")]
 )
-def test_no_space_has_an_error_of_its_own(tmp_path: Path, number: int, said: str) -> None:
+def test_missing_disk_space_raises_its_own_error(tmp_path: Path, number: int, said: str) -> None:
     with pytest.raises(DiskFullError, match=said), storage_errors(tmp_path / "file"):
         raise OSError(number, os.strerror(number))
 

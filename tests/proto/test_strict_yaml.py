@@ -1,4 +1,4 @@
-"""YAML is read as version 1.2 says, and what is ambiguous is refused."""
+"""YAML is read as defined in version 1.2, and ambiguous values are refused."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_values(text: str, value: Any) -> None:
         ("[" * 5000, "nested too deeply"),
     ],
 )
-def test_what_is_refused(text: str, said: str) -> None:
+def test_invalid_yaml_is_refused(text: str, said: str) -> None:
     with pytest.raises(yaml.YAMLError, match=said):
         load_yaml(text)
 
@@ -65,7 +65,7 @@ def test_what_is_refused(text: str, said: str) -> None:
 )
 @example("0E0")
 @example({"1e3": "0o7"})
-def test_what_is_dumped_is_read_back(value: Any) -> None:
+def test_dumped_yaml_is_read_back_unchanged(value: Any) -> None:
     text = dump_yaml(value)
     assert load_yaml(text) == value
     assert yaml.safe_load(text) == value, "YAML 1.1 reads the same"

@@ -25,7 +25,7 @@ VARIABLES = (
 
 
 @given(st.integers(0, 2**63 - 1))
-def test_what_is_drawn_is_valid_and_repeats_with_its_seed(seed: int) -> None:
+def test_a_random_situation_is_valid_and_repeats_with_its_seed(seed: int) -> None:
     situation = sample_situation(VARIABLES, seed)
     check_situation(situation, VARIABLES, "task")
     assert situation == sample_situation(VARIABLES, seed)
@@ -37,7 +37,7 @@ def test_all_choices_are_drawn() -> None:
 
 
 @given(st.floats(0.2, 0.3), st.sampled_from(("standing", "laying")))
-def test_what_is_written_is_read_back(y: float, kind: str) -> None:
+def test_a_written_situation_is_read_back_unchanged(y: float, kind: str) -> None:
     read = parse_situation(f"kind={kind}, object_y_m={y!r}", VARIABLES, "task")
     assert read == {"object_y_m": y, "kind": kind}
 
@@ -54,7 +54,7 @@ def test_what_is_written_is_read_back(y: float, kind: str) -> None:
         ({"object_y_m": 0.25, "kind": 1.0}, "kind = 1.0 is none of"),
     ],
 )
-def test_what_is_wrong_is_named(situation: Situation, problem: str) -> None:
+def test_the_problem_is_named(situation: Situation, problem: str) -> None:
     with pytest.raises(UserError, match=problem):
         check_situation(situation, VARIABLES, "task")
 
@@ -68,12 +68,12 @@ def test_what_is_wrong_is_named(situation: Situation, problem: str) -> None:
         ("object_y_m=0.2,kinds=laying", "a situation has object_y_m, kind"),
     ],
 )
-def test_what_cannot_be_read_is_named(text: str, problem: str) -> None:
+def test_a_text_that_cannot_be_parsed_is_refused(text: str, problem: str) -> None:
     with pytest.raises(UserError, match=problem):
         parse_situation(text, VARIABLES, "task")
 
 
-def test_a_choice_is_not_taken_for_a_number() -> None:
+def test_a_choice_is_not_accepted_as_a_number() -> None:
     situation = {"object_y_m": 0.25, "kind": "laying"}
     assert number_of(situation, "object_y_m") == 0.25
     with pytest.raises(TypeError, match="kind = 'laying' is a choice"):

@@ -1,4 +1,4 @@
-"""Episodes that were really played, shared by the tests of what works on them."""
+"""Recorded episodes and a checkpoint for several tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A board holds every process's newest metrics and knows who vanished; `vmdnn watch` shows it."""
+"""A board keeps the newest metrics and the vanished processes; `vmdnn watch` shows them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def publish(bus: Bus, metrics: Metrics) -> None:
     bus.publish(key, metrics)
 
 
-def test_the_newest_metrics_are_kept_and_who_dies_vanishes(hub: HubConfig) -> None:
+def test_the_newest_metrics_are_kept_and_dead_processes_vanish(hub: HubConfig) -> None:
     process = (Role.ACTOR, "a-1")
     with open_bus(hub, RUN, Role.WATCH, "w") as bus, join_as(hub, ACTOR) as actor:
         board = Board(bus)
@@ -54,7 +54,7 @@ def test_the_newest_metrics_are_kept_and_who_dies_vanishes(hub: HubConfig) -> No
         eventually(lambda: process in board.view().vanished_s, "the actor has vanished")
         assert board.view().living(ActorMetrics) == []
         with join_as(hub, ACTOR):
-            eventually(lambda: process not in board.view().vanished_s, "the actor is back")
+            eventually(lambda: process not in board.view().vanished_s, "the actor is present again")
 
 
 def test_other_runs_are_not_seen(hub: HubConfig) -> None:
@@ -69,7 +69,7 @@ def test_other_runs_are_not_seen(hub: HubConfig) -> None:
         assert not other.view().metrics
 
 
-def test_once_prints_every_process_as_it_told(
+def test_once_prints_the_metrics_of_every_process(
     hub: HubConfig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments = ["watch", "--connect", hub.endpoint, "--set", f"run.name={RUN}", "--once", "--json"]
@@ -90,7 +90,7 @@ def test_once_prints_every_process_as_it_told(
     assert answer["vanished"] == []
 
 
-def test_a_run_of_which_nobody_tells_is_named(
+def test_a_run_without_processes_is_reported(
     hub: HubConfig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["watch", "--connect", hub.endpoint, "--once", "--set", "run.name=nobody"]) == 1

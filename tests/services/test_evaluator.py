@@ -1,4 +1,4 @@
-"""The evaluator as a process: hands out, counts once, carries on."""
+"""The evaluator as a process assigns trials, counts each once, and continues after a kill."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MakeEpisode = Callable[..., Episode]
 
 
 class EvaluatorSetup:
-    """A hub, an evaluator, and sessions that act as learner and actors."""
+    """A hub, an evaluator, and sessions that play the roles of learner and actors."""
 
     def __init__(self, stack: ExitStack, folder: Path, make_episode: MakeEpisode) -> None:
         self._stack = stack
@@ -48,7 +48,7 @@ class EvaluatorSetup:
             *("--set", "done.policy_versions=2"),
         )
         stack.enter_context(listening_hub(self.endpoint))
-        self.told: EvaluatorMetrics | None = None
+        self.metrics: EvaluatorMetrics | None = None
         self.learner = self.join(Role.LEARNER, "learner")
         self.learner.subscribe(
             self.learner.keys.metrics(Role.EVALUATOR), self._listen, EvaluatorMetrics
@@ -58,7 +58,7 @@ class EvaluatorSetup:
         self.process = self.start()
 
     def start(self) -> Popen[bytes]:
-        self.told = None
+        self.metrics = None
         self.process = self._stack.enter_context(vmdnn("evaluator", *self.words))
         return self.process
 
@@ -91,26 +91,27 @@ class EvaluatorSetup:
     def verdicts_by_seed(self) -> dict[int, Verdict]:
         return {verdict.seed: verdict for verdict in self.verdicts}
 
-    def tells(self, what: Callable[[EvaluatorMetrics], bool]) -> EvaluatorMetrics:
-        eventually(lambda: self.told is not None and what(self.told), "the metrics it should tell")
-        assert self.told is not None
-        return self.told
+    def wait_for_metrics(self, ready: Callable[[EvaluatorMetrics], bool]) -> EvaluatorMetrics:
+        """Wait until the newest metrics satisfy `ready`."""
+        eventually(lambda: self.metrics is not None and ready(self.metrics), "the expected metrics")
+        assert self.metrics is not None
+        return self.metrics
 
     def send(self, actor: Bus, seed: int, version: int, **fields: object) -> Episode:
-        """Send a rollout until its receipt comes."""
+        """Send a rollout until its receipt arrives."""
         episode = self._episode(actor, seed, version, **fields)
         rollout = Rollout(episode, "training")
         assert self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout) == ""
         return episode
 
     def refused(self, actor: Bus, seed: int, version: int, **fields: object) -> str:
-        """Send a rollout until it is refused; gives the reason."""
+        """Send a rollout until it is refused; return the reason."""
         episode = self._episode(actor, seed, version, **fields)
         rollout = Rollout(episode, "training")
         return self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout)
 
     def fail(self, actor: Bus, report: EpisodeFailed) -> str:
-        """Report a failed simulation until it is answered; gives the refusal, or nothing."""
+        """Report a failed simulation until its receipt arrives; return the refusal."""
         return self._answer(actor, report.id, actor.keys.failure(actor.id), report)
 
     def _episode(self, actor: Bus, seed: int, version: int, **fields: object) -> Episode:
@@ -132,7 +133,7 @@ class EvaluatorSetup:
         return answers()[0].refusal
 
     def _listen(self, metrics: EvaluatorMetrics) -> None:
-        self.told = metrics
+        self.metrics = metrics
 
 
 @pytest.fixture
@@ -151,7 +152,7 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
     seeds = [setup.ask_until_given(actor, 1), *setup.ask(other, 1), *setup.ask(actor, 1)]
     assert seeds == [70, 71, 72]
     assert setup.ask(other, 1) == [], "all three are being played"
-    setup.tells(lambda told: told.leases == 3)
+    setup.wait_for_metrics(lambda metrics: metrics.leases == 3)
 
     setup.send(actor, 70, 1)
     setup.send(actor, 70, 1)
@@ -159,12 +160,12 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
     setup.send(other, 71, 1, outcome=NOT_LIFTED)
     assert setup.refused(other, 99, 1) == "no trial with the seed 99 is asked for"
     setup.send(actor, 5, 1, kind=Kind.PRACTICE)
-    told = setup.tells(lambda told: counts(told) == {1: 2})
-    score = told.policies[0]
+    metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 2})
+    score = metrics.policies[0]
     assert (score.precise.successes, score.precise.rate) == (1, 0.5)
     assert score.precise.wilson95 == pytest.approx((0.0945, 0.9055), abs=1e-3)
     assert score.reasons == {"not_lifted": 1}
-    assert not told.done
+    assert not metrics.done
 
     setup.publish(2)
     assert setup.ask_until_given(actor, 2) == 70
@@ -172,13 +173,13 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
     setup.send(actor, 72, 1)  # was under way when the newer policy came
     for seed in (70, 71, 72):
         setup.send(actor, seed, 2)
-    told = setup.tells(lambda told: counts(told) == {1: 3, 2: 3})
-    assert told.done
-    assert told.leases == 0
+    metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 3, 2: 3})
+    assert metrics.done
+    assert metrics.leases == 0
     assert setup.ask(actor, 2) == [], "the newest policy is counted in full"
 
 
-def test_the_learner_hears_of_practice_but_never_of_the_situations_of_trials(
+def test_the_learner_gets_verdicts_of_practice_but_not_of_trials(
     setup: EvaluatorSetup,
 ) -> None:
     actor = setup.join(Role.ACTOR, "a")
@@ -194,12 +195,12 @@ def test_the_learner_hears_of_practice_but_never_of_the_situations_of_trials(
     practised = setup.send(actor, 2**30, 1, kind=Kind.PRACTICE, outcome=NOT_LIFTED)
     eventually(lambda: bool(setup.verdicts), "a verdict")
     assert set(setup.verdicts_by_seed()) == {2**30}
-    told = setup.verdicts_by_seed()[2**30]
-    assert (told.run_id, told.policy_version, told.task) == ("training", 1, "experiment1")
-    assert (told.outcome, dict(told.situation)) == (NOT_LIFTED, dict(practised.situation))
+    verdict = setup.verdicts_by_seed()[2**30]
+    assert (verdict.run_id, verdict.policy_version, verdict.task) == ("training", 1, "experiment1")
+    assert (verdict.outcome, dict(verdict.situation)) == (NOT_LIFTED, dict(practised.situation))
 
 
-def test_a_killed_evaluator_carries_on_with_what_it_counted(setup: EvaluatorSetup) -> None:
+def test_a_killed_evaluator_keeps_its_counts(setup: EvaluatorSetup) -> None:
     actor = setup.join(Role.ACTOR, "a")
     setup.publish(1)
     assert setup.ask_until_given(actor, 1) == 70
@@ -209,7 +210,7 @@ def test_a_killed_evaluator_carries_on_with_what_it_counted(setup: EvaluatorSetu
     setup.start()
     setup.send(actor, 70, 1)  # its receipt might have been lost
     assert setup.ask_until_given(actor, 1) == 71
-    assert counts(setup.tells(lambda told: bool(told.policies))) == {1: 1}
+    assert counts(setup.wait_for_metrics(lambda metrics: bool(metrics.policies))) == {1: 1}
     assert stop(setup.process) == 0
 
 
@@ -223,9 +224,9 @@ def test_a_trial_whose_simulation_fails_is_a_failure_and_is_not_played_again(
     assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
     assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
     assert "seed 99" in setup.fail(actor, failure("nobody-asked", seed=99, **trial))
-    told = setup.tells(lambda told: counts(told) == {1: 1})
-    assert told.policies[0].reasons == {"simulation_failed": 1}
-    assert told.policies[0].lenient.successes == 0
+    metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 1})
+    assert metrics.policies[0].reasons == {"simulation_failed": 1}
+    assert metrics.policies[0].lenient.successes == 0
     assert setup.ask(actor, 1) == [71]
     setup.process.kill()
     setup.process.wait()
@@ -233,7 +234,7 @@ def test_a_trial_whose_simulation_fails_is_a_failure_and_is_not_played_again(
     assert setup.ask_until_given(actor, 1) == 71
 
 
-def test_a_trial_of_an_actor_that_died_is_given_to_another(setup: EvaluatorSetup) -> None:
+def test_a_trial_of_a_dead_actor_is_assigned_to_another(setup: EvaluatorSetup) -> None:
     mortal, other = setup.join(Role.ACTOR, "mortal"), setup.join(Role.ACTOR, "other")
     mortal.announce()
     setup.publish(1)
@@ -243,18 +244,18 @@ def test_a_trial_of_an_actor_that_died_is_given_to_another(setup: EvaluatorSetup
     eventually(lambda: setup.ask(other, 1) == [70], "the dead actor's trial")
 
 
-def test_a_new_training_is_counted_anew(setup: EvaluatorSetup) -> None:
+def test_a_new_training_is_counted_separately(setup: EvaluatorSetup) -> None:
     actor = setup.join(Role.ACTOR, "a")
     setup.publish(5)
     assert setup.ask_until_given(actor, 5) == 70
     setup.send(actor, 70, 5)
-    setup.tells(lambda told: counts(told) == {5: 1})
+    setup.wait_for_metrics(lambda metrics: counts(metrics) == {5: 1})
     setup.publish(1, run_id="started-from-nothing")
-    setup.tells(lambda told: counts(told) == {})
+    setup.wait_for_metrics(lambda metrics: counts(metrics) == {})
     assert setup.ask(actor, 1, run_id="started-from-nothing") == [70]
 
 
-def test_a_pause_stops_the_handing_out_but_not_the_counting(setup: EvaluatorSetup) -> None:
+def test_a_paused_evaluator_counts_but_assigns_no_trials(setup: EvaluatorSetup) -> None:
     actor = setup.join(Role.ACTOR, "a")
     setup.publish(1)
     setup.ask_until_given(actor, 1)
@@ -262,7 +263,7 @@ def test_a_pause_stops_the_handing_out_but_not_the_counting(setup: EvaluatorSetu
     assert [r.note for r in actor.ask(control, Control(Command.PAUSE), ControlReply)] == ["paused"]
     assert setup.ask(actor, 1) == []
     setup.send(actor, 70, 1)
-    setup.tells(lambda told: told.paused and counts(told) == {1: 1})
+    setup.wait_for_metrics(lambda metrics: metrics.paused and counts(metrics) == {1: 1})
     actor.ask(control, Control(Command.RESUME), ControlReply)
     assert setup.ask(actor, 1) == [71]
     actor.ask(control, Control(Command.STOP), ControlReply)
@@ -270,13 +271,13 @@ def test_a_pause_stops_the_handing_out_but_not_the_counting(setup: EvaluatorSetu
 
 
 def test_a_second_evaluator_of_the_same_folder_is_refused(setup: EvaluatorSetup) -> None:
-    setup.tells(lambda _: True)
+    setup.wait_for_metrics(lambda _: True)
     second = run_vmdnn("evaluator", *setup.words, "--id", "second")
     assert second.returncode == 2
     assert "already works in" in second.stderr
 
 
-def test_without_a_hub_it_says_what_to_do(tmp_path: Path) -> None:
+def test_without_a_hub_it_prints_what_to_do(tmp_path: Path) -> None:
     words = ("--connect", free_endpoint(), "--set", f"run.folder={tmp_path}")
     ended = run_vmdnn("evaluator", *words)
     assert ended.returncode == 2

@@ -1,4 +1,4 @@
-"""The policy that newcomers see first, in the world that they see it in."""
+"""The pre-trained policy in the default simulator."""
 
 from __future__ import annotations
 

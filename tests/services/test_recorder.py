@@ -1,4 +1,4 @@
-"""A real recorder process on a real bus keeps every rollout once."""
+"""A real recorder process on a real bus records every rollout once."""
 
 from __future__ import annotations
 
@@ -46,28 +46,28 @@ class Listener:
     """Receives the recorder's metrics."""
 
     def __init__(self, bus: Bus) -> None:
-        self._told: RecorderMetrics | None = None
+        self._newest: RecorderMetrics | None = None
         self._changed = threading.Condition()
         bus.subscribe(bus.keys.metrics(Role.RECORDER), self._listen, RecorderMetrics)
 
     def wait_for(self, ready: Callable[[RecorderMetrics], bool]) -> RecorderMetrics:
-        """The first metrics for which `ready` holds."""
+        """Wait for metrics for which `ready` returns true, and return them."""
 
-        def told() -> bool:
-            return self._told is not None and ready(self._told)
+        def is_ready() -> bool:
+            return self._newest is not None and ready(self._newest)
 
         with self._changed:
-            assert self._changed.wait_for(told, timeout=60), f"the last metrics: {self._told}"
-            assert self._told is not None
-            return self._told
+            assert self._changed.wait_for(is_ready, timeout=60), f"the last metrics: {self._newest}"
+            assert self._newest is not None
+            return self._newest
 
     def forget(self) -> None:
         with self._changed:
-            self._told = None
+            self._newest = None
 
     def _listen(self, metrics: RecorderMetrics) -> None:
         with self._changed:
-            self._told = metrics
+            self._newest = metrics
             self._changed.notify_all()
 
 
@@ -94,12 +94,12 @@ def test_every_rollout_is_kept_once(
 ) -> None:
     with open_bus(hub, RUN, Role.ACTOR, "actor") as bus, recorder(hub, tmp_path) as process:
         listener = Listener(bus)
-        listener.wait_for(lambda told: told.episodes == 0)
+        listener.wait_for(lambda metrics: metrics.episodes == 0)
         sent = [rollout(f"rollout{number}", number or None) for number in range(5)]
         for message in [*sent, *sent[:2]]:
             bus.deliver(bus.keys.rollout("actor"), message)
-        told = listener.wait_for(lambda told: told.episodes == 5)
-        assert (told.dropped, told.refused) == (0, 0)
+        metrics = listener.wait_for(lambda metrics: metrics.episodes == 5)
+        assert (metrics.dropped, metrics.refused) == (0, 0)
         assert files(tmp_path) == [f"rollout{number}.mcap" for number in range(5)]
         kept = read_episode(tmp_path / RUN / "rollouts" / "rollout3.mcap")
         assert np.array_equal(kept.images, sent[3].episode.images)
@@ -107,26 +107,26 @@ def test_every_rollout_is_kept_once(
         assert stop(process) == 0
 
 
-def test_a_restarted_recorder_carries_on_and_keeps_trials_only_if_told(
+def test_a_restarted_recorder_continues_and_can_keep_trials_only(
     hub: HubConfig, rollout: Callable[..., Rollout], tmp_path: Path
 ) -> None:
     with open_bus(hub, RUN, Role.ACTOR, "actor") as bus:
         listener = Listener(bus)
         for number in (0, 1):
             with recorder(hub, tmp_path, "recorder.practice=false") as process:
-                listener.wait_for(lambda told: told.episodes == 0)
+                listener.wait_for(lambda metrics: metrics.episodes == 0)
                 bus.deliver(bus.keys.rollout("actor"), rollout("practised", None))
                 bus.deliver(bus.keys.rollout("actor"), rollout("before", 7))
                 bus.deliver(bus.keys.rollout("actor"), rollout(f"during{number}", number))
                 # the second time, `before` is there already
-                listener.wait_for(lambda told, number=number: told.episodes == 2 - number)
+                listener.wait_for(lambda metrics, number=number: metrics.episodes == 2 - number)
                 process.kill()
                 process.wait()
                 listener.forget()
     assert files(tmp_path) == ["before.mcap", "during0.mcap", "during1.mcap"]
 
 
-def test_without_a_hub_it_says_so(tmp_path: Path) -> None:
+def test_without_a_hub_it_reports_an_error(tmp_path: Path) -> None:
     words = ("--connect", free_endpoint(), "--set", f"run.folder={tmp_path}")
     result = run_vmdnn("recorder", *words)
     assert result.returncode == 2

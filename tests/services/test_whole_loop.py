@@ -1,4 +1,4 @@
-"""Hub, learner, evaluator, recorder and actors together, and killed in the middle of it all."""
+"""Hub, learner, evaluator, recorder and actors together, while processes are killed."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> None:
+def test_nothing_is_lost_or_counted_twice_when_processes_are_killed(tmp_path: Path) -> None:
     with ExitStack() as stack:
         loop = Loop(stack, tmp_path)
         loop.start_hub()
@@ -99,12 +99,12 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
         bus = stack.enter_context(open_bus(config, "loop", Role.WATCH, "watch"))
         lives: list[Live] = []
         policies: list[PolicyVersion] = []
-        told: dict[str, Metrics] = {}
+        newest: dict[str, Metrics] = {}
         bus.subscribe(bus.keys.live("actor-1"), lives.append, Live)
         kinds: set[Kind] = set()
         bus.subscribe(bus.keys.live(), lambda live: kinds.add(live.kind), Live)
         bus.subscribe_newest(bus.keys.policy, policies.append, PolicyVersion)
-        bus.subscribe(bus.keys.metrics(), lambda m: told.update({m.id: m}), *METRICS)
+        bus.subscribe(bus.keys.metrics(), lambda m: newest.update({m.id: m}), *METRICS)
 
         eventually(lambda: any(live.step > 20 for live in lives), "a demonstration is going on")
         loop.kill_and_restart("actor", "actor-1")
@@ -122,7 +122,7 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
         loop.kill_and_restart("actor", "actor-1")
 
         def done() -> bool:
-            learner, evaluator = told.get("learner"), told.get("evaluator")
+            learner, evaluator = newest.get("learner"), newest.get("evaluator")
             return (
                 isinstance(learner, LearnerMetrics)
                 and isinstance(evaluator, EvaluatorMetrics)
@@ -137,7 +137,7 @@ def test_nothing_is_lost_or_counted_twice_whoever_is_killed(tmp_path: Path) -> N
 
         def tells_what_it_counted() -> bool:
             counted = Counter(trial["policy_version"] for trial in lines(trials))
-            evaluator = told["evaluator"]
+            evaluator = newest["evaluator"]
             return isinstance(evaluator, EvaluatorMetrics) and counted == {
                 score.version: score.trials for score in evaluator.policies
             }

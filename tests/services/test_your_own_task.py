@@ -1,4 +1,4 @@
-"""What docs/your-own-task.md says works as it stands there, from tutoring to the figure."""
+"""The task and all commands of docs/your-own-task.md work, from tutoring to the figure."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_the_commands_of_the_page_work(folder: Path, capsys: pytest.CaptureFixtu
     assert (folder / "failures.png").stat().st_size > 10_000
 
 
-def test_its_recordings_carry_its_words(folder: Path) -> None:
+def test_its_recordings_contain_its_names(folder: Path) -> None:
     episode = read_episode(folder / "rollouts" / "trial0000.mcap")
     assert episode.task == "touch:TouchBox"
     assert episode.phase_names == ("look", "reach", "rest")
@@ -69,7 +69,7 @@ def test_its_recordings_carry_its_words(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("folder")
-def test_a_choice_is_written_on_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_choice_can_be_given_on_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     words = "evaluate --task touch:TouchBox --policy tutor --workers 1 --json --situation"
     assert main([*words.split(), "box_y_m=0.3,place=left"]) == 0
     assert json.loads(capsys.readouterr().out)["trials"] == 1

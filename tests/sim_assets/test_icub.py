@@ -109,7 +109,7 @@ def test_colliders_span_the_arm_from_joint_to_joint(robot):
     assert np.linalg.norm(end - wrist) < forearm.radius_m
 
 
-def test_the_look_covers_what_each_view_needs(built):
+def test_the_visuals_cover_the_links_that_each_view_needs(built):
     eye = {visual.link for visual in built.seen_by_eye}
     outside = {visual.link for visual in built.seen_from_outside}
     hand = {phalanx.link for phalanx in PHALANGES}
@@ -122,12 +122,12 @@ def faces(visuals, link):
     return sum(len(trimesh.load(v.mesh).faces) for v in visuals if v.link == link)
 
 
-def test_the_eye_sees_simple_meshes_where_outside_is_full(built):
+def test_the_eye_renders_simplified_meshes(built):
     assert faces(built.seen_from_outside, "r_upper_arm") > 15000
     assert 100 < faces(built.seen_by_eye, "r_upper_arm") <= 1000
 
 
-def test_meshes_lie_where_the_official_ones_do(built):
+def test_meshes_have_the_official_positions(built):
     """The forearm's mesh spans its collider, in metres and in the link's frame."""
     forearm = next(visual for visual in built.seen_by_eye if visual.link == "r_forearm")
     low, high = trimesh.load(forearm.mesh).bounds
@@ -145,7 +145,7 @@ def test_the_build_is_cached(built):
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
-def test_many_may_build_at_once(tmp_path: Path):
+def test_several_processes_can_build_at_once(tmp_path: Path):
     models = []
     threads = [
         threading.Thread(target=lambda: models.append(build_icub(tmp_path))) for _ in range(2)

@@ -2,26 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
-import numpy as np
-
-from actors.tasks.contract import FigureWords, GraspError
+from actors.tasks.contract import FigureWords
 from actors.tasks.experiment1 import judge
+from actors.tasks.grasp_errors import grasp_errors
 from proto.episode import NO_FAILURE, Outcome
-from proto.variables import Situation, number_of
-
-
-def _measured(name: str) -> Callable[[Outcome, Situation], float]:
-    return lambda outcome, _: outcome.value(name)
-
-
-def _offset_in_y_mm(outcome: Outcome, situation: Situation) -> float:
-    """Offset of the hand from the object along Y of the task frame."""
-    turn = np.deg2rad(number_of(situation, "object_yaw_deg"))
-    along, across = outcome.value("along_mm"), outcome.value("across_mm")
-    return float(along * np.cos(turn) - across * np.sin(turn))
 
 
 def _in_place(outcome: Outcome) -> bool:
@@ -41,24 +27,6 @@ FIGURE_WORDS: Final = FigureWords(
         judge.MOVED_OBJECT: "moved the object",
         judge.TOUCHED_OBSTACLE: "touched the obstacle",
     },
-    errors=(
-        GraspError(
-            "yaw_error_deg",
-            "yaw error\n(degrees)",
-            judge.YAW_ERROR_DEG,
-            _measured("yaw_error_deg"),
-            variable="object_yaw_deg",
-        ),
-        GraspError("along_mm", "offset along\n(mm)", judge.ALONG_MM, _measured("along_mm")),
-        GraspError("across_mm", "offset across\n(mm)", judge.ACROSS_MM, _measured("across_mm")),
-        GraspError(
-            "position_mm",
-            "offset in Y\n(mm)",
-            judge.ALONG_MM,
-            _offset_in_y_mm,
-            variable="object_y_m",
-            per_unit=1e3,
-        ),
-    ),
+    errors=grasp_errors(judge.TOLERANCE, yaw="object_yaw_deg", y="object_y_m"),
     in_place=_in_place,
 )

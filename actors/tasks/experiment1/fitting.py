@@ -9,7 +9,6 @@ obstacles and table, and angles within the joint limits.
 
 from __future__ import annotations
 
-from importlib.resources import as_file
 from typing import Final
 
 import numpy as np
@@ -19,11 +18,12 @@ from actors.kinematics import Arm, ArmPose, ClearanceBox
 from actors.motion import interpolate_postures
 from actors.posture_fitting import (
     ANGLE,
-    LIMIT,
     LOOSE_POSITION,
     POSITION,
     fit_polynomial,
+    limit_violations,
     shortfall,
+    write_postures,
 )
 from actors.tasks.experiment1.postures import (
     FITTED,
@@ -42,9 +42,8 @@ from actors.tasks.experiment1.world import (
     obstacle_pose,
 )
 from proto.body import ARM
-from proto.storage import written_whole
 from proto.variables import Situation, number_of
-from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
+from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, OPEN_DEG
 
 Array = NDArray[np.float64]
 
@@ -101,18 +100,13 @@ class PostureFitter:
         )
 
     def _limits(self, posture: Array) -> Array:
-        low, high = self._arm.minimum_rad, self._arm.maximum_rad
-        beyond = np.maximum(low - posture, posture - high) + LIMIT
-        return np.asarray(np.maximum(0.0, beyond) / LIMIT)
+        return limit_violations(self._arm, posture)
 
     def _table(self, pose: ArmPose, margin: float = TABLE_MARGIN_M) -> Array:
-        return shortfall(pose.points_m[:, 2] - self._arm.radii_m, margin)
+        return shortfall(self._arm.heights(pose), margin)
 
     def _obstacle(self, pose: ArmPose, situation: Situation, margin: float) -> Array:
-        return shortfall(self._distances(pose, _obstacle_box(situation)), margin)
-
-    def _distances(self, pose: ArmPose, box: ClearanceBox) -> Array:
-        return np.asarray(box.distance(pose.points_m) - self._arm.radii_m)
+        return shortfall(self._arm.clearances(pose, _obstacle_box(situation)), margin)
 
     def _fit_grasp(self) -> Array:
         start = np.zeros((len(OBJECT_ORDERS), 7))
@@ -124,7 +118,7 @@ class PostureFitter:
             pose = self._arm.pose(posture)
             box = _object_box(situation)
             across, along = box.level_axes()
-            offset = pose.rotation @ GRASP_CENTRE_M + pose.position_m - box.centre_m
+            offset = pose.grasp_centre_m - box.centre_m
             axis = pose.rotation @ GRASP_AXIS
             down = -(pose.rotation @ APPROACH_AXIS)[2]
             return np.concatenate(
@@ -133,7 +127,7 @@ class PostureFitter:
                     [offset[2] / (3 * POSITION)],
                     [axis @ along / ANGLE, axis[2] / (4 * ANGLE)],
                     [max(0.0, np.cos(STEEPEST_APPROACH_RAD) - down) / (4 * ANGLE)],
-                    shortfall(self._distances(pose, box), OBJECT_MARGIN_M),
+                    shortfall(self._arm.clearances(pose, box), OBJECT_MARGIN_M),
                     self._table(pose),
                     self._obstacle(pose, NEAREST_OBSTACLE, OBSTACLE_MARGIN_M),
                     self._limits(posture),
@@ -154,7 +148,7 @@ class PostureFitter:
             box = _object_box(self._objects[i])
             across, along = box.level_axes()
             target = box.centre_m + np.array([0.0, 0.0, height_m])
-            offset = pose.rotation @ GRASP_CENTRE_M + pose.position_m - target
+            offset = pose.grasp_centre_m - target
             axis = pose.rotation @ GRASP_AXIS
             turned = (pose.rotation @ APPROACH_AXIS) - grasps[i].rotation @ APPROACH_AXIS
             return np.concatenate(
@@ -163,7 +157,7 @@ class PostureFitter:
                     [offset[2] / (2 * POSITION * loose)],
                     [axis @ along / (ANGLE * loose), axis[2] / (4 * ANGLE * loose)],
                     turned / (3 * ANGLE * loose),
-                    shortfall(self._distances(pose, box), OBJECT_MARGIN_M),
+                    shortfall(self._arm.clearances(pose, box), OBJECT_MARGIN_M),
                     self._table(pose),
                     self._obstacle(pose, NEAREST_OBSTACLE, OBSTACLE_MARGIN_M),
                     self._limits(posture),
@@ -180,9 +174,8 @@ class PostureFitter:
 
         def residual(posture: Array, i: int) -> Array:
             pose = self._arm.pose(posture)
-            lifted = pose.rotation @ GRASP_CENTRE_M + pose.position_m
-            centre = grasps[i].rotation @ GRASP_CENTRE_M + grasps[i].position_m
-            offset = lifted - centre - np.array([0.0, 0.0, height_m])
+            lift = np.array([0.0, 0.0, height_m])
+            offset = pose.grasp_centre_m - grasps[i].grasp_centre_m - lift
             return np.concatenate(
                 [
                     offset / [3 * LOOSE_POSITION, 3 * LOOSE_POSITION, 3 * POSITION],
@@ -213,7 +206,7 @@ class PostureFitter:
             situation = self._obstacles[i]
             box = _obstacle_box(situation)
             pose = self._arm.pose(posture)
-            hand = pose.position_m + pose.rotation @ GRASP_CENTRE_M
+            hand = pose.grasp_centre_m
             on_the_way = [
                 self._obstacle(self._arm.pose(between), situation, PASSING_MARGIN_M)
                 for corner in corners
@@ -221,7 +214,7 @@ class PostureFitter:
                     [posture, corner], np.array([0.1, 0.2, 0.35, 0.5, 0.75])
                 )
             ]
-            lowest = float((pose.points_m[:, 2] - self._arm.radii_m)[self._arm.of_hand].min())
+            lowest = float(self._arm.heights(pose)[self._arm.of_hand].min())
             return np.concatenate(
                 [
                     [(hand[0] - box.centre_m[0]) / LOOSE_POSITION],
@@ -244,7 +237,7 @@ class PostureFitter:
             situation = self._obstacles[i]
             box = _obstacle_box(situation)
             pose = self._arm.pose(posture)
-            hand = pose.position_m + pose.rotation @ GRASP_CENTRE_M
+            hand = pose.grasp_centre_m
             leftmost = float((pose.points_m[:, 0] - self._arm.radii_m)[self._arm.of_hand].min())
             way = interpolate_postures(
                 [self._start, posture, after[i]], np.linspace(0.05, 0.95, 19)
@@ -285,10 +278,7 @@ def _obstacle_box(situation: Situation) -> ClearanceBox:
 
 def main() -> None:
     """Fit all key postures and write them to the file that `load_key_postures` reads."""
-    text = PostureFitter().fit().to_json()
-    with as_file(FITTED) as path, written_whole(path) as stream:
-        stream.write(text.encode())
-    print(f"wrote {FITTED}")
+    write_postures(FITTED, PostureFitter().fit().to_json())
 
 
 if __name__ == "__main__":

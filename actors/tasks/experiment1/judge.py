@@ -18,7 +18,14 @@ from numpy.typing import NDArray
 
 from actors.simulator import Pose, StepReport
 from actors.tasks.experiment1.world import object_pose
-from actors.tasks.grasp_reading import HandOffset, closed_at, half_turn, hand_offset, yaw_deg
+from actors.tasks.grasp_reading import (
+    GraspTolerance,
+    HandOffset,
+    closed_at,
+    half_turn,
+    hand_offset,
+    yaw_deg,
+)
 from proto.episode import NO_FAILURE, Measure, Outcome
 from proto.variables import Situation
 from sim_assets.icub import HAND
@@ -29,9 +36,7 @@ LIFTED_M: Final = 0.05
 HELD_STEPS: Final = 5
 MOVED_MM: Final = 10.0
 TURNED_DEG: Final = 5.0
-YAW_ERROR_DEG: Final = 10.0
-ALONG_MM: Final = 20.0
-ACROSS_MM: Final = 10.0
+TOLERANCE: Final = GraspTolerance(yaw_error_deg=10.0, along_mm=20.0, across_mm=10.0)
 
 TOUCHED_OBSTACLE: Final = "touched_obstacle"
 MOVED_OBJECT: Final = "moved_object"
@@ -97,11 +102,7 @@ class Experiment1Judge:
         held = min(lifted_m) > LIFTED_M
         unmoved = before.moved_mm <= MOVED_MM and before.turned_deg <= TURNED_DEG
         strict = held and unmoved and closed_step >= 0 and touched_at < 0
-        right = (
-            abs(before.hand.yaw_error_deg) <= YAW_ERROR_DEG
-            and abs(before.hand.along_mm) <= ALONG_MM
-            and abs(before.hand.across_mm) <= ACROSS_MM
-        )
+        right = TOLERANCE.allows(before.hand)
         failures = (
             (touched_at >= 0, TOUCHED_OBSTACLE),
             (not unmoved, MOVED_OBJECT),

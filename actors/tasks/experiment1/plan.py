@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from actors.attention import clip_action
 from actors.kinematics import Gaze
-from actors.motion import interpolate_postures, minimum_jerk, ramp
+from actors.motion import move_through, ramp
 from actors.tasks.experiment1.postures import KeyPostures, load_key_postures
 from actors.tasks.experiment1.world import (
     START,
@@ -71,8 +71,7 @@ def _arm(situation: Situation, postures: KeyPostures) -> Array:
         return postures.start if name == "start" else postures.arm_deg(name, situation)
 
     def through(*names: str, moving: int, total: int) -> Array:
-        fraction = minimum_jerk(np.arange(1, total + 1) / moving)
-        return interpolate_postures([posture(name) for name in names], fraction)
+        return move_through([posture(name) for name in names], moving, total)
 
     n = SUBTASKS
     across, reach, descend = n["move over obstacle"], n["reach above object"], n["descend"]

@@ -1,27 +1,13 @@
-"""What figures say about Experiment II."""
+"""Labels and grasp errors of Experiment II for figures."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
-import numpy as np
-
-from actors.tasks.contract import FigureWords, GraspError
+from actors.tasks.contract import FigureWords
 from actors.tasks.experiment2 import judge
+from actors.tasks.grasp_errors import grasp_errors
 from proto.episode import NO_FAILURE, Outcome
-from proto.variables import Situation, number_of
-
-
-def _measured(name: str) -> Callable[[Outcome, Situation], float]:
-    return lambda outcome, _: outcome.value(name)
-
-
-def _offset_in_y_mm(outcome: Outcome, situation: Situation) -> float:
-    """Offset of the hand from the indicated object in Y of the task frame."""
-    turn = np.deg2rad(number_of(situation, "indicated_yaw_deg"))
-    along, across = outcome.value("along_mm"), outcome.value("across_mm")
-    return float(along * np.cos(turn) - across * np.sin(turn))
 
 
 def _in_place(outcome: Outcome) -> bool:
@@ -44,24 +30,6 @@ FIGURE_WORDS: Final = FigureWords(
         judge.OTHER_MOVED: "moved the other object",
         judge.WRONG_OBJECT: "chose the wrong object",
     },
-    errors=(
-        GraspError(
-            "yaw_error_deg",
-            "yaw error\n(degrees)",
-            judge.YAW_ERROR_DEG,
-            _measured("yaw_error_deg"),
-            variable="indicated_yaw_deg",
-        ),
-        GraspError("along_mm", "offset along\n(mm)", judge.ALONG_MM, _measured("along_mm")),
-        GraspError("across_mm", "offset across\n(mm)", judge.ACROSS_MM, _measured("across_mm")),
-        GraspError(
-            "position_mm",
-            "offset in Y\n(mm)",
-            judge.ALONG_MM,
-            _offset_in_y_mm,
-            variable="indicated_y_m",
-            per_unit=1e3,
-        ),
-    ),
+    errors=grasp_errors(judge.TOLERANCE, yaw="indicated_yaw_deg", y="indicated_y_m"),
     in_place=_in_place,
 )

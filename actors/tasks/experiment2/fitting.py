@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.resources import as_file
 from typing import Final
 
 import numpy as np
@@ -21,11 +20,12 @@ from actors.kinematics import Arm, ArmPose, ClearanceBox
 from actors.motion import interpolate_postures
 from actors.posture_fitting import (
     ANGLE,
-    LIMIT,
     LOOSE_POSITION,
     POSITION,
     fit_polynomial,
+    limit_violations,
     shortfall,
+    write_postures,
 )
 from actors.tasks.experiment2.postures import (
     FAMILIES,
@@ -39,8 +39,7 @@ from actors.tasks.experiment2.postures import (
 from actors.tasks.experiment2.setting import KINDS, PlacedObject, other_place
 from actors.tasks.experiment2.world import START, TABLE_DROP_M, Y_RANGE_M, YAW_RANGE_DEG
 from proto.body import ARM
-from proto.storage import written_whole
-from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
+from sim_assets.hand import APPROACH_AXIS, GRASP_AXIS, OPEN_DEG
 
 Array = NDArray[np.float64]
 
@@ -130,27 +129,22 @@ class FamilyFitter:
         )
 
     def _limits(self, posture: Array) -> Array:
-        low, high = self._arm.minimum_rad, self._arm.maximum_rad
-        beyond = np.maximum(low - posture, posture - high) + LIMIT
-        return np.asarray(np.maximum(0.0, beyond) / LIMIT)
+        return limit_violations(self._arm, posture)
 
     def _table(self, pose: ArmPose, margin_m: float = TABLE_MARGIN_M) -> Array:
-        return shortfall(pose.points_m[:, 2] - self._arm.radii_m, margin_m)
-
-    def _distances(self, pose: ArmPose, box: ClearanceBox) -> Array:
-        return np.asarray(box.distance(pose.points_m) - self._arm.radii_m)
+        return shortfall(self._arm.heights(pose), margin_m)
 
     def _clear_of_others(self, pose: ArmPose, margin_m: float) -> Array:
         """Clearance of the other object, of either kind, at both ends of its range."""
         return np.concatenate(
-            [shortfall(self._distances(pose, box).min(), margin_m) for box in self._others]
+            [shortfall(self._arm.clearances(pose, box).min(), margin_m) for box in self._others]
         )
 
     def _clear(self, pose: ArmPose, box: ClearanceBox) -> Array:
         """Clearance of the object, the table and the other object while the hand is open."""
         return np.concatenate(
             [
-                shortfall(self._distances(pose, box), OBJECT_MARGIN_M),
+                shortfall(self._arm.clearances(pose, box), OBJECT_MARGIN_M),
                 self._table(pose),
                 self._clear_of_others(pose, OTHER_MARGIN_M),
             ]
@@ -174,7 +168,7 @@ class FamilyFitter:
             pose, box = self._arm.pose(posture), self._boxes[i]
             across, along = box.level_axes()
             target = np.array([*box.centre_m[:2], self._style.height_m])
-            offset = grasp_centre(pose) - target
+            offset = pose.grasp_centre_m - target
             axis = pose.rotation @ GRASP_AXIS
             return np.concatenate(
                 [
@@ -192,14 +186,14 @@ class FamilyFitter:
     def _fit_retreat(self, grasp: Array, below: Array, share: float) -> Array:
         """The open hand, moved back from its grasp by a share of the retreat, turned alike."""
         grasps = [self._arm.pose(posture) for posture in self._features @ grasp]
-        targets = [grasp_centre(pose) + share * self._retreat_m(pose) for pose in grasps]
+        targets = [pose.grasp_centre_m + share * self._retreat_m(pose) for pose in grasps]
         before = self._features @ below
         loose = 1.0 + 4.0 * share
 
         def residual(posture: Array, i: int) -> Array:
             pose, box = self._arm.pose(posture), self._boxes[i]
             _, along = box.level_axes()
-            offset = grasp_centre(pose) - targets[i]
+            offset = pose.grasp_centre_m - targets[i]
             axis = pose.rotation @ GRASP_AXIS
             turned = (pose.rotation - grasps[i].rotation) @ APPROACH_AXIS
             return np.concatenate(
@@ -228,7 +222,7 @@ class FamilyFitter:
 
         def residual(posture: Array, i: int) -> Array:
             pose = self._arm.pose(posture)
-            offset = grasp_centre(pose) - grasp_centre(grasps[i]) - np.array([0.0, 0.0, height_m])
+            offset = pose.grasp_centre_m - grasps[i].grasp_centre_m - np.array([0.0, 0.0, height_m])
             return np.concatenate(
                 [
                     offset / [3 * LOOSE_POSITION, 3 * LOOSE_POSITION, 3 * POSITION],
@@ -255,7 +249,7 @@ class FamilyFitter:
             for between in interpolate_postures([self._start, posture, ends[i]], shares):
                 pose = self._arm.pose(between)
                 parts += [
-                    shortfall(self._distances(pose, box).min(), PASSING_MARGIN_M),
+                    shortfall(self._arm.clearances(pose, box).min(), PASSING_MARGIN_M),
                     self._clear_of_others(pose, PASSING_MARGIN_M),
                     self._table(pose, 0.01),
                     self._limits(between),
@@ -265,11 +259,6 @@ class FamilyFitter:
         constant = np.ones((len(corners), 1))
         fitted = fit_polynomial(constant, residual, (middle + RAISED_RAD)[None], np.zeros(1))
         return np.asarray(fitted[0])
-
-
-def grasp_centre(pose: ArmPose) -> Array:
-    """Grasp centre (3,) of the hand in the world frame (m)."""
-    return np.asarray(pose.rotation @ GRASP_CENTRE_M + pose.position_m)
 
 
 def _clearance_box(placed: PlacedObject) -> ClearanceBox:
@@ -283,10 +272,7 @@ def fit_key_postures() -> KeyPostures:
 
 def main() -> None:
     """Fit all key postures and write them where `load_key_postures` finds them."""
-    text = fit_key_postures().to_json()
-    with as_file(FITTED) as path, written_whole(path) as stream:
-        stream.write(text.encode())
-    print(f"wrote {FITTED}")
+    write_postures(FITTED, fit_key_postures().to_json())
 
 
 if __name__ == "__main__":

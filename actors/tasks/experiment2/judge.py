@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from actors.simulator import Pose, StepReport
 from actors.tasks.experiment2.setting import PlacedObject, Setting
 from actors.tasks.grasp_reading import (
+    GraspTolerance,
     HandOffset,
     closed_at,
     grasp_centre_m,
@@ -35,9 +36,7 @@ HELD_STEPS: Final = 5
 MOVED_MM: Final = 10.0
 TOPPLED_DEG: Final = 15.0
 OTHER_MOVED_MM: Final = 5.0
-YAW_ERROR_DEG: Final = 8.0
-ALONG_MM: Final = 15.0
-ACROSS_MM: Final = 10.0
+TOLERANCE: Final = GraspTolerance(yaw_error_deg=8.0, along_mm=15.0, across_mm=10.0)
 
 WRONG_OBJECT: Final = "wrong_object"
 OTHER_MOVED: Final = "other_moved"
@@ -126,7 +125,7 @@ class Experiment2Judge:
             (before.moved_mm > MOVED_MM, MOVED_OBJECT),
             (closed_step < 0, NEVER_CLOSED),
             (min(lifted_m) <= LIFTED_M, NOT_LIFTED),
-            (not _is_right(before.hand), IMPRECISE),
+            (not TOLERANCE.allows(before.hand), IMPRECISE),
         )
         reason = next((reason for failed, reason in failures if failed), NO_FAILURE)
         return Outcome(
@@ -172,11 +171,3 @@ def _moved_mm(placed: PlacedObject, now: Pose) -> float:
 
 def _distance_mm(hand: Pose, body: Pose) -> float:
     return 1e3 * float(np.linalg.norm(grasp_centre_m(hand) - body.position_m))
-
-
-def _is_right(hand: HandOffset) -> bool:
-    return (
-        abs(hand.yaw_error_deg) <= YAW_ERROR_DEG
-        and abs(hand.along_mm) <= ALONG_MM
-        and abs(hand.across_mm) <= ACROSS_MM
-    )

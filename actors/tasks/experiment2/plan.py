@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from actors.attention import clip_action
 from actors.kinematics import Gaze
-from actors.motion import interpolate_postures, minimum_jerk, ramp
+from actors.motion import move_through, ramp
 from actors.tasks.experiment2.postures import FamilyPostures, load_key_postures
 from actors.tasks.experiment2.setting import PlacedObject, Setting
 from actors.tasks.experiment2.world import START, SUBTASKS, TABLE_DROP_M, first_steps
@@ -72,8 +72,7 @@ def _arm(target: PlacedObject, postures: FamilyPostures, subtasks: Mapping[str, 
         return START[ARM] if name == "start" else postures.arm_deg(name, target)
 
     def through(*names: str, moving: int, total: int) -> Array:
-        share = minimum_jerk(np.arange(1, total + 1) / moving)
-        return interpolate_postures([posture(name) for name in names], share)
+        return move_through([posture(name) for name in names], moving, total)
 
     resting = first_steps(subtasks)["reach above object"]
     reach, approach = subtasks["reach above object"], subtasks["approach"]

@@ -1,4 +1,4 @@
-"""Which backends the conformance suite is run on: all built-in ones, or that of `--backend`."""
+"""Runs the conformance suite on all built-in backends, or on that of `--backend`."""
 
 from __future__ import annotations
 
@@ -33,6 +33,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _chosen(config: pytest.Config) -> str | None:
-    # pytest knows the option only if it is told of this folder on its command line
+    # pytest has the option only if this folder is named on its command line.
     chosen: str | None = config.getoption(OPTION, default=None)
     return chosen

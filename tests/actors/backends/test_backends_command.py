@@ -1,4 +1,4 @@
-"""`python -m actors.backends` tells deploy/setup.sh whether the chosen backend can render."""
+"""`python -m actors.backends` reports to deploy/setup.sh whether a backend can render."""
 
 from __future__ import annotations
 

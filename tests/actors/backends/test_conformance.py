@@ -1,4 +1,4 @@
-"""What every backend must do: frames, control, contact, repeatability and pictures.
+"""Requirements for every backend: frames, control, contact, repeatability and pictures.
 
 The suite runs on all built-in backends, or on one of your own; see docs/your-own-simulator.md.
 """
@@ -92,13 +92,13 @@ def values(joints: JointTargets):
 # --- the class --------------------------------------------------------------------------------
 
 
-def test_it_knows_that_it_can_render_here(backend):
+def test_it_reports_that_it_can_render_here(backend):
     diagnosis = load_backend(backend).diagnose()
     assert diagnosis.works, diagnosis.text()
     assert diagnosis.found
 
 
-def test_it_tells_its_name_and_its_control_period(backend, blind, another):
+def test_it_has_its_name_and_the_control_period(backend, blind, another):
     assert blind.name == backend
     assert blind.control_period_s == 0.1
     assert another(render=False, control_period_s=0.02).control_period_s == 0.02
@@ -131,7 +131,7 @@ def test_bodies_are_the_boxes_and_the_moving_links(blind):
     assert not {"root_link", "torso_1", "chest"} & names
 
 
-def test_every_motor_gets_where_it_is_told(blind):
+def test_every_motor_reaches_its_target(blind):
     blind.reset(scene(TABLE))
     goal = targets(arm=(-50.0, 50.0, 10.0, 80.0, 20.0, -10.0, -5.0), neck=(-20.0, 15.0), level=6.0)
     run(blind, 15, goal)
@@ -190,14 +190,14 @@ def test_a_touch_between_two_control_steps_is_not_missed(blind):
     assert blind.bodies()["falling"].position_m[2] < 0.2
 
 
-def test_near_is_not_touching(blind):
+def test_a_near_body_is_not_reported_as_touching(blind):
     beside = Box("beside", (0.05, 0.05, 0.05), Pose((0.0, 0.3, 0.025)), (1, 1, 1), watched=True)
     near = Box("near", (0.05, 0.05, 0.05), Pose((0.051, 0.3, 0.025)), (1, 1, 1), mass_kg=0.1)
     blind.reset(scene(TABLE, beside, near))
     assert not any(blind.step(targets()).touches for _ in range(5))
 
 
-def test_what_is_not_watched_is_not_reported(blind):
+def test_touches_of_unwatched_bodies_are_not_reported(blind):
     blind.reset(scene())
     assert blind.step(targets()).touches == frozenset()  # though the object stands on the table
 
@@ -279,7 +279,7 @@ def grey_at(simulator, point_m):
     return float(simulator.observe(Crop()).image[seen_at(simulator, point_m, 64, 48)])
 
 
-def test_the_network_can_tell_hand_object_obstacle_and_table_apart(seeing):
+def test_hand_object_obstacle_and_table_have_different_brightness(seeing):
     seeing.reset(scene())
     hand = grey_at(seeing, seeing.bodies()["r_middle_1"].position_m)
     thing = grey_at(seeing, (0.06, 0.25, 0.07))
@@ -315,7 +315,7 @@ def test_a_recorded_state_can_be_shown_again(seeing):
     ],
     ids=["up", "to the robot", "tilted", "to the right"],
 )
-def test_a_surface_is_as_bright_as_the_shared_light_says(seeing, normal, quaternion):
+def test_the_brightness_of_a_surface_follows_the_shared_light(seeing, normal, quaternion):
     """A plate whose upper side is turned to `normal`, at the left before the robot."""
     centre, colour = np.array((-0.15, 0.35, 0.25)), (0.5, 0.3, 0.8)
     plate = Box("plate", (0.1, 0.1, 0.01), Pose(tuple(centre), quaternion), colour)

@@ -1,4 +1,4 @@
-"""The cameras and the pictures that every backend shows."""
+"""The cameras and pictures that all backends share."""
 
 from __future__ import annotations
 

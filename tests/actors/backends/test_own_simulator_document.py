@@ -1,4 +1,4 @@
-"""docs/your-own-simulator.md: its backend plays episodes, and the suite runs on it."""
+"""The backend of docs/your-own-simulator.md plays episodes and passes the conformance suite."""
 
 from __future__ import annotations
 

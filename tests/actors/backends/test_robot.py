@@ -38,13 +38,13 @@ def test_motors_are_in_the_order_of_the_observed_joints():
     assert len(JOINT_NAMES) == MOTOR_COUNT
 
 
-def test_motor_angles_come_back_from_the_joints_that_they_move():
+def test_motor_angles_are_recovered_from_the_joints_that_they_move():
     motors_deg = np.random.default_rng(0).uniform(0.0, 60.0, MOTOR_COUNT)
     joints_rad = joints_from_motors_rad(motors_deg)
     assert joints_rad.shape == (28,)
     assert motors_from_joints_deg(joints_rad) == pytest.approx(motors_deg)
 
 
-def test_a_ramp_ends_at_its_target_and_leaves_out_its_start():
+def test_a_ramp_ends_at_its_target_and_does_not_include_its_start():
     before, after = np.zeros(MOTOR_COUNT), np.full(MOTOR_COUNT, 4.0)
     assert motor_ramp_deg(before, after, 4)[:, 0].tolist() == [1.0, 2.0, 3.0, 4.0]

@@ -1,4 +1,4 @@
-"""On a machine that cannot render, the user is told what to install, however the driver fails."""
+"""On a machine that cannot render, the message says what to install."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_device_that_renders_is_named():
 
 
 @pytest.mark.usefixtures("no_driver")
-def test_without_a_driver_every_cure_is_named():
+def test_without_a_driver_every_remedy_is_named():
     diagnosis = SapienSimulator.diagnose()
     assert not diagnosis.works
     assert "no Vulkan driver was found" in diagnosis.found
@@ -100,7 +100,7 @@ def test_a_driver_that_kills_its_process_is_reported(monkeypatch, tmp_path, beha
     assert "bookworm-backports" in diagnosis.text()
 
 
-def test_its_driver_draws_in_the_calling_thread(monkeypatch):
+def test_its_driver_renders_in_the_calling_thread(monkeypatch):
     """Mesa otherwise starts a thread for each core in each process."""
     monkeypatch.delenv("LP_NUM_THREADS", raising=False)
     program = (
@@ -148,7 +148,7 @@ def test_the_shader_has_the_shared_light():
     }  # fmt: skip
 
 
-def test_nothing_else_names_its_driver():
+def test_no_other_module_names_its_driver():
     root = Path(renderer.__file__).parents[3]
     packages = ("proto", "sim_assets", "learner", "actors", "services", "deploy")
     naming = [

@@ -1,4 +1,4 @@
-"""A policy that is guided goes its own way, but not far, and the tutor's plan is what is meant."""
+"""A guided policy acts within a range around the tutor's plan, which is the target."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SITUATION = {"obstacle_x_m": -0.24, "object_y_m": 0.28, "object_yaw_deg": 40.0}
 
 
 class Shifted(PlannedPolicy):
-    """Acts as the tutor does, but a little beside."""
+    """Acts like the tutor, with a constant added to all actions."""
 
     version = 7
 
@@ -42,7 +42,7 @@ def guided(policy: PlannedPolicy, guidance_deg: float) -> Episode:
         simulator.close()
 
 
-def test_small_errors_are_left_and_large_ones_held() -> None:
+def test_small_errors_are_kept_and_large_errors_are_clipped() -> None:
     meant = plan(SITUATION)
     for by, guidance_deg in ((0.5, 5.0), (-7.0, 5.0), (7.0, 0.0)):
         policy = GuidedPolicy(Shifted(by), make_tutor(TASK), guidance_deg)
@@ -54,8 +54,8 @@ def test_small_errors_are_left_and_large_ones_held() -> None:
         np.testing.assert_allclose(off, np.tile(np.clip(by, -slack, slack), (len(meant), 1)))
 
 
-def test_a_policy_that_sees_nothing_is_brought_to_its_goal() -> None:
-    # alone it comes with the hand turned wrong, and shoves the object
+def test_a_blind_policy_succeeds_under_guidance() -> None:
+    # Without guidance its hand has the wrong yaw and pushes the object.
     blind = PlannedPolicy("yaw-blind", TASK, TASK.baselines["yaw-blind"])
     episode = guided(blind, guidance_deg=2.0)
     assert episode.outcome.strict, episode.outcome
@@ -63,4 +63,4 @@ def test_a_policy_that_sees_nothing_is_brought_to_its_goal() -> None:
     np.testing.assert_allclose(episode.targets, plan(SITUATION), atol=1e-4)
     off = np.abs(episode.actions - episode.targets).max(0)
     assert off.max() <= 2.0 + 1e-4
-    assert off[:9].max() > 1.9, "it had its own way as far as it was let"
+    assert off[:9].max() > 1.9, "it differs from the plan as far as the guidance allows"

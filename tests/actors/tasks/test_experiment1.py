@@ -1,4 +1,4 @@
-"""Experiment I: its situations, and what counts as success."""
+"""Experiment I: its situations and its readings of success."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ SITUATION = {"obstacle_x_m": -0.27, "object_y_m": 0.25, "object_yaw_deg": 20.0}
 NO_TOUCH = StepReport(frozenset())
 
 
-def test_the_45_tutored_cases_are_the_papers():
+def test_the_45_tutored_cases_are_those_of_the_paper():
     cases = TASK.tutored()
     assert len(cases) == 45
     assert {case["obstacle_x_m"] for case in cases} == {-0.22, -0.27, -0.32}
@@ -77,13 +77,13 @@ def test_samples_fill_the_ranges():
         ({"object_y_m": 0.25}, "obstacle_x_m"),
     ],
 )
-def test_a_situation_outside_the_task_is_refused(situation, part):
+def test_an_invalid_situation_is_refused(situation, part):
     with pytest.raises(UserError, match=part):
         TASK.check(situation)
 
 
 def bodies(*, height=0.0, moved=0.0, turned=0.0, hand_yaw=0.0, along=0.0, across=0.0):
-    """The object and a hand that would grasp it exactly, each displaced as told (m, degrees)."""
+    """Return poses of the object and of a hand that grasps it exactly, both displaced (m, deg)."""
     start = object_pose(SITUATION)
     yaw = Rotation.from_quat(np.roll(start.quaternion, -1)).as_euler("xyz")[2]
     object_turn = Rotation.from_euler("z", yaw + np.deg2rad(turned))
@@ -101,7 +101,7 @@ def bodies(*, height=0.0, moved=0.0, turned=0.0, hand_yaw=0.0, along=0.0, across
 
 
 def judged(open_bodies, lifted=0.1, *, closed=True, touch_at=None):
-    """An episode: 60 steps with the hand open, 30 closed, 10 lifted."""
+    """Judge an episode: 60 steps with the hand open, 30 closed, 10 lifted."""
     judge = TASK.judge(SITUATION)
     touch = StepReport(frozenset({("obstacle", ROBOT)}))
     for step in range(100):
@@ -112,7 +112,7 @@ def judged(open_bodies, lifted=0.1, *, closed=True, touch_at=None):
     return judge.outcome()
 
 
-def test_a_right_grasp_is_precise():
+def test_a_correct_grasp_is_precise():
     outcome = judged(bodies())
     assert (outcome.lenient, outcome.strict, outcome.precise) == (True, True, True)
     assert outcome.reason == NO_FAILURE
@@ -125,7 +125,7 @@ def test_a_right_grasp_is_precise():
 
 @pytest.mark.parametrize("turned_too_far_deg", [-30.0, -8.0, 8.0, 30.0])
 def test_the_yaw_error_has_the_sign_of_the_task_frame(turned_too_far_deg):
-    """A hand at a yaw that the task calls larger than the object's errs by a positive angle."""
+    """The error is positive if the hand's yaw in the task frame is larger than the object's."""
     flaw = bodies(hand_yaw=-turned_too_far_deg)  # the task frame is left-handed
     assert judged(flaw).value("yaw_error_deg") == pytest.approx(turned_too_far_deg)
 
@@ -138,7 +138,7 @@ def test_the_yaw_error_has_the_sign_of_the_task_frame(turned_too_far_deg):
         ({"turned": -5.5}, "moved_object"),
     ],
 )
-def test_an_object_shoved_before_the_hand_closes_is_lenient_only(flaw, reason):
+def test_an_object_pushed_before_the_hand_closes_is_lenient_only(flaw, reason):
     outcome = judged(bodies(**flaw))
     assert (outcome.lenient, outcome.strict, outcome.precise) == (True, False, False)
     assert outcome.reason == reason
@@ -184,6 +184,6 @@ def test_a_hand_that_never_closed_did_not_grasp():
         ({"gestures": "videos"}, "task.gestures: the task experiment1 has no such option"),
     ],
 )
-def test_a_configuration_that_no_task_fits_is_refused(values, problem):
+def test_an_unknown_task_or_option_is_refused(values, problem):
     with pytest.raises(UserError, match=problem):
         make_task(TaskConfig.model_validate(values))

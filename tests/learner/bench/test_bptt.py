@@ -25,7 +25,7 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("_short")
-def test_all_contenders_are_measured(capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_implementations_are_measured(capsys: pytest.CaptureFixture[str]) -> None:
     threads = torch.get_num_threads()
     sizes = ["--batch", "3", "--steps", "5", "--threads", "1"]
     try:
@@ -46,7 +46,7 @@ def test_operations_of_the_papers_network() -> None:
     assert bench.operations(VMDNN(NetworkConfig())) == 2 * (2 * 6720 + 3 * 13500)
 
 
-def test_steps_of_the_benchmark_see_what_the_network_sees() -> None:
+def test_steps_of_the_benchmark_have_the_networks_inputs() -> None:
     network = VMDNN(NetworkConfig())
     network.initialize(torch.Generator().manual_seed(1), initial_range=0.1, pfc_input_range=0.1)
     images = torch.rand(2, 4, 48, 64) * 2 - 1

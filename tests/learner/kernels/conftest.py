@@ -1,4 +1,4 @@
-"""Kernels are tested where they can be compiled."""
+"""Skips the tests of kernels on machines that cannot compile them."""
 
 from __future__ import annotations
 

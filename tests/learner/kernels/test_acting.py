@@ -51,7 +51,7 @@ def images() -> NDArray[np.float32]:
     return np.random.default_rng(2).uniform(-1, 1, (5, 11, 14)).astype(np.float32)
 
 
-def test_it_has_a_state_until_it_is_reset(images: NDArray[np.float32]) -> None:
+def test_it_keeps_its_state_until_it_is_reset(images: NDArray[np.float32]) -> None:
     kernel = ActingKernel(SIZES, parameters())
     first = run(kernel, images)
     assert not np.array_equal(run(kernel, images), first)
@@ -60,7 +60,7 @@ def test_it_has_a_state_until_it_is_reset(images: NDArray[np.float32]) -> None:
     np.testing.assert_allclose(first.sum(-1), 1.0, rtol=1e-5)
 
 
-def test_networks_have_states_of_their_own(images: NDArray[np.float32]) -> None:
+def test_each_network_has_its_own_state(images: NDArray[np.float32]) -> None:
     expected = run(ActingKernel(SIZES, parameters()), images)
     one, other = ActingKernel(SIZES, parameters()), ActingKernel(SIZES, parameters())
     first = run(one, images[:2])

@@ -1,4 +1,4 @@
-"""The compiled step of Adam does what its definition in PyTorch does."""
+"""The compiled step of Adam agrees with its definition in PyTorch."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_other_types_are_not_supported() -> None:
 
 
 @pytest.mark.parametrize("dtype", list(TOLERANCES))
-def test_a_gradient_of_zero_is_no_trap(dtype: torch.dtype) -> None:
+def test_a_gradient_of_zero_changes_no_weights(dtype: torch.dtype) -> None:
     zeros = AdamArrays(*(torch.zeros(5, dtype=dtype) for _ in range(4)))
     adam.step(zeros, number=1, rate=0.1, max_norm=1.0)
     assert not zeros.weights.any()

@@ -71,6 +71,6 @@ def test_second_derivatives_are_refused() -> None:
         torch.autograd.grad(activity.sum(), maps.kernel, create_graph=True)
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_arrays_of_wrong_shape_are_refused() -> None:
     with pytest.raises(ValueError, match="below"):
         kernel.maps(torch.ones(1, 1, 2, 5, 5), torch.ones(1, 3, 2, 2), torch.ones(1), 1, 2.0)

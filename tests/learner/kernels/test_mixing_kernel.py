@@ -1,4 +1,4 @@
-"""The compiled mixtures are those of PyTorch and numpy."""
+"""The compiled mixtures agree with those of PyTorch and numpy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def code() -> SoftmaxCode:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_kernel_mixes_as_the_definition_does(
+def test_the_kernel_mixes_as_defined(
     dtype: torch.dtype, code: SoftmaxCode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen = draw(5, 7, 21, dtype=dtype)
@@ -57,7 +57,7 @@ def test_the_kernel_mixes_as_the_definition_does(
         ({"targets": torch.ones(5, 7, 3)}, "targets"),
     ],
 )
-def test_what_does_not_fit_is_refused(
+def test_arrays_of_wrong_shape_are_refused(
     changes: dict[str, Tensor], message: str, code: SoftmaxCode
 ) -> None:
     arrays = {

@@ -1,4 +1,4 @@
-"""Where the system refuses to start threads, the kernels compute in the calling thread."""
+"""If the system cannot start threads, the kernels compute in the calling thread."""
 
 from __future__ import annotations
 

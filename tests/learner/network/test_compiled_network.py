@@ -1,4 +1,4 @@
-"""The compiled network that acts gives the numbers of the one in numpy."""
+"""The compiled network agrees with the numpy network."""
 
 from __future__ import annotations
 
@@ -97,14 +97,14 @@ def networks(draw: st.DrawFn) -> NetworkConfig:
 @pytest.mark.usefixtures("_compiled")
 @settings(max_examples=100, deadline=None)
 @given(config=networks())
-def test_any_network_gives_the_numbers_of_numpy(config: NetworkConfig) -> None:
+def test_any_network_agrees_with_numpy(config: NetworkConfig) -> None:
     weights = max(np.prod(shape[1:]) for shape in parameter_shapes(config).values())
     assert worst_error(config, steps=6, limit=2 / np.sqrt(weights)) < 3e-6
 
 
 @pytest.mark.usefixtures("_compiled")
 @pytest.mark.parametrize("order", ["bottom_up", "literal"])
-def test_the_papers_network_gives_the_numbers_of_numpy_through_a_whole_episode(order: str) -> None:
+def test_the_papers_network_agrees_with_numpy_in_a_whole_episode(order: str) -> None:
     config = NetworkConfig.model_validate({"update_order": order})
     assert worst_error(config, steps=130, limit=0.2) < 3e-6
 
@@ -131,7 +131,7 @@ def test_reset_returns_to_the_neutral_state(order: str) -> None:
 
 
 @pytest.mark.usefixtures("_compiled")
-def test_networks_have_states_of_their_own() -> None:
+def test_each_network_has_its_own_state() -> None:
     config = NetworkConfig()
     parameters, images = parameters_of(config), images_for(4)
     alone = CompiledNetwork(config, parameters)
@@ -160,13 +160,8 @@ def test_wrong_sizes_are_refused() -> None:
         CompiledNetwork(config, other)
 
 
-def test_without_a_compiler_numpy_acts(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: object, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
-    monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
+@pytest.mark.usefixtures("no_compiler")
+def test_without_a_compiler_numpy_acts(caplog: pytest.LogCaptureFixture) -> None:
     acting_library.cache_clear()
     try:
         config = NetworkConfig()

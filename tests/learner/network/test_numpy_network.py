@@ -22,7 +22,7 @@ ODD_SIZES = {
 
 @pytest.mark.parametrize("order", ["bottom_up", "literal"])
 @pytest.mark.parametrize("sizes", [{}, ODD_SIZES], ids=["paper", "odd"])
-def test_stepping_gives_the_numbers_of_the_whole_sequence(
+def test_single_steps_agree_with_the_whole_sequence(
     order: UpdateOrder, sizes: dict[str, object]
 ) -> None:
     config = NetworkConfig.model_validate({**sizes, "update_order": order})
@@ -39,7 +39,7 @@ def test_stepping_gives_the_numbers_of_the_whole_sequence(
         stepping.reset()
 
 
-def test_activity_is_that_of_the_subnets_as_they_learn() -> None:
+def test_activity_equals_that_in_training() -> None:
     config = NetworkConfig.model_validate(ODD_SIZES)
     network = VMDNN(config).double()
     network.initialize(torch.Generator().manual_seed(1), initial_range=0.3, pfc_input_range=0.5)

@@ -15,7 +15,7 @@ FRACTIONS = st.lists(st.floats(0, 1), min_size=ACTION_SIZE, max_size=ACTION_SIZE
 
 
 @given(FRACTIONS, FRACTIONS, FRACTIONS)
-def test_decoding_gives_back_what_was_encoded(
+def test_decoding_inverts_encoding(
     one: list[float], other: list[float], between: list[float]
 ) -> None:
     ends = LOWEST + (HIGHEST - LOWEST) * np.array([one, other])
@@ -35,7 +35,7 @@ def test_values_outside_the_range_are_coded_as_its_end() -> None:
     np.testing.assert_array_equal(code.encode(LOWEST - 50), code.encode(LOWEST / 2))
 
 
-def test_decoded_action_is_within_what_the_robot_accepts() -> None:
+def test_decoded_actions_are_within_the_robots_limits() -> None:
     code = SoftmaxCode.of_ranges(LOWEST, HIGHEST, NetworkConfig())
     last_unit_only = np.zeros((ACTION_SIZE, 10))
     last_unit_only[:, -1] = 1

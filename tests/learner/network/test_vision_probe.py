@@ -1,4 +1,4 @@
-"""What the vision tells is asked on sequences that nothing was fitted to."""
+"""The vision is scored on sequences that were not used for fitting."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def vision(trainer: Trainer, tmp_path: Path) -> Vision:
     return Vision(load_checkpoint(path))
 
 
-def test_the_classifier_answers_as_it_has_learned(
+def test_the_classifier_scores_the_situations_that_it_learned(
     vision: Vision, bar_episodes: MakeEpisodes
 ) -> None:
     learned = score_classifier(vision, bar_episodes(**LEARNED))
@@ -84,7 +84,7 @@ def test_a_policy_has_no_classifier(trainer: Trainer, bar_episodes: MakeEpisodes
     assert score_regression(policy, bar_episodes(), bar_episodes())
 
 
-def test_the_vision_tells_what_lies_between_the_classes(
+def test_values_between_the_classes_can_be_read_from_the_vision(
     vision: Vision, bar_episodes: MakeEpisodes
 ) -> None:
     scores = score_regression(vision, bar_episodes(**LEARNED), bar_episodes(**OTHERS))
@@ -95,7 +95,7 @@ def test_the_vision_tells_what_lies_between_the_classes(
     assert last["object_y_m"].error < 0.4 * 0.025
 
 
-def test_nothing_can_be_asked_of_sequences_that_are_all_alike(
+def test_sequences_without_variation_have_no_scores(
     vision: Vision, bar_episodes: MakeEpisodes
 ) -> None:
     alike = bar_episodes(places=(0.5,), slopes=(0.5,))
@@ -111,7 +111,7 @@ def refitted(features: Array, values: Array, penalty: float, others: Array) -> A
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.3, 3.0])
-def test_the_penalty_is_the_one_that_tells_left_out_values_best(noise: float) -> None:
+def test_the_penalty_minimizes_the_leave_one_out_error(noise: float) -> None:
     random = np.random.default_rng(1)
     values = np.repeat([-45.0, -22.5, 0.0, 22.5, 45.0], 4)
     pattern = random.normal(size=7) / 45
@@ -127,5 +127,5 @@ def test_the_penalty_is_the_one_that_tells_left_out_values_best(noise: float) ->
 
     scale = np.square(features - features.mean(0)).sum() / len(values)
     best = min(PENALTIES * scale, key=error)
-    told = ridge_regression(features, values, others)
-    np.testing.assert_allclose(told, refitted(features, values, best, others), rtol=1e-5)
+    predicted = ridge_regression(features, values, others)
+    np.testing.assert_allclose(predicted, refitted(features, values, best, others), rtol=1e-5)

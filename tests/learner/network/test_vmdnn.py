@@ -60,7 +60,7 @@ def test_gradient_agrees_with_finite_differences(order: UpdateOrder) -> None:
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_what_follows_a_step_does_not_change_it(order: UpdateOrder) -> None:
+def test_later_pictures_do_not_change_earlier_outputs(order: UpdateOrder) -> None:
     network = network_of(order)
     images = some_images(12)
     changed = images.clone()

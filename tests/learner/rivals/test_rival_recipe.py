@@ -1,4 +1,4 @@
-"""The networks that VMDNN is compared with: their size, what they learn, and how they act."""
+"""The networks that VMDNN is compared with: their size, their training, and their actions."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_it_has_about_as_many_weights_as_vmdnn(kind: RivalKind) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_learns_what_the_pictures_tell(
+def test_it_learns_to_use_the_pictures(
     kind: RivalKind,
     store: TutoringStore,
     tmp_path: Path,
@@ -92,12 +92,12 @@ def test_it_learns_what_the_pictures_tell(
             policy.begin({}, seed=0)
             ends.append([policy.step(image) for image in episode.images][-1])
         taught = (right.targets[-1] - left.targets[-1])[1::2]  # only these tell the place
-        told = (ends[1] - ends[0])[1::2]
-        assert (told > 0.1 * taught).all()
+        acted = (ends[1] - ends[0])[1::2]
+        assert (acted > 0.1 * taught).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_training_that_was_stopped_goes_on_exactly(
+def test_a_stopped_training_continues_exactly(
     kind: RivalKind, store: TutoringStore, tmp_path: Path
 ) -> None:
     whole, parts = tmp_path / "whole", tmp_path / "parts"
@@ -111,7 +111,7 @@ def test_a_training_that_was_stopped_goes_on_exactly(
     assert len(list(policy_file(whole, 1).parent.iterdir())) == 1, "one policy, at the end"
 
 
-def test_the_vision_stays_as_the_first_stage_left_it(store: TutoringStore, tmp_path: Path) -> None:
+def test_the_second_stage_does_not_change_the_vision(store: TutoringStore, tmp_path: Path) -> None:
     epochs = iter(range(1, 7))
     train(tmp_path, "cnn-lstm", store, lambda _: next(epochs) < 3)
     formed = load_checkpoint(training_file(tmp_path)).part(NETWORK_PREFIX)
@@ -132,7 +132,7 @@ def trained(store: TutoringStore, tmp_path: Path) -> Callable[[RivalKind], Check
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_acts_step_by_step_as_it_learned_whole_sequences(
+def test_acting_step_by_step_agrees_with_whole_sequences(
     kind: RivalKind,
     trained: Callable[[RivalKind], Checkpoint],
     bar_episodes: Callable[..., Sequence[Episode]],

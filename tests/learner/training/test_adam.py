@@ -1,4 +1,4 @@
-"""Adam does what PyTorch's Adam does after PyTorch's clipping, compiled or not."""
+"""Adam agrees with PyTorch's Adam after PyTorch's clipping, compiled or not."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_steps_are_those_of_pytorch(
     assert_alike(results, expected, tolerance)
 
 
-def test_it_goes_on_from_a_state_of_pytorch() -> None:
+def test_it_continues_from_a_state_of_pytorch() -> None:
     """Their names are the same, so that checkpoints are."""
     parameters = parameters_of()
     state = learn_as_pytorch(parameters, range(1, 6), None).state_dict()["state"]
@@ -86,7 +86,7 @@ def test_it_goes_on_from_a_state_of_pytorch() -> None:
     assert_alike(parameters, expected)
 
 
-def test_a_part_of_the_state_is_missing() -> None:
+def test_an_incomplete_state_is_refused() -> None:
     adam = Adam(parameters_of())
     tensors = adam.tensors()
     del tensors["1.exp_avg"]
@@ -94,7 +94,7 @@ def test_a_part_of_the_state_is_missing() -> None:
         adam.load_tensors(tensors)
 
 
-def test_parameters_stay_what_they_were() -> None:
+def test_parameters_keep_their_values_and_get_zero_gradients() -> None:
     parameters = parameters_of()
     Adam(parameters)
     for parameter, values in zip(parameters, draw(0), strict=True):

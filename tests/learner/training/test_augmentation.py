@@ -1,4 +1,4 @@
-"""Augmented images: whole sequences are shifted, each in its own direction."""
+"""Augmentation shifts all images of a sequence alike, and each sequence differently."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All ways to compute the loss and its gradients agree with the stepwise one, in float64."""
+"""All implementations of the loss and its gradients agree with the stepwise one in float64."""
 
 from __future__ import annotations
 
@@ -99,18 +99,30 @@ def loss_and_gradients(
 def in_single_precision(
     network: VMDNN, sequences: Sequences, chosen: Tensor, initial: Tensor
 ) -> list[Tensor]:
-    """What the kernel computes in float32."""
+    """Compute loss and gradients with the kernel in float32."""
     single = VMDNN(network.config)
     single.load_state_dict(network.state_dict())
     narrowed = as_type(sequences, torch.float32)
     return loss_and_gradients(divergence, single, narrowed, chosen, initial.float())
 
 
-def assert_alike(results: list[Tensor], expected: list[Tensor], tolerance: float) -> None:
-    """To within a part of the largest entry of each tensor."""
+def assert_alike(
+    results: list[Tensor], expected: list[Tensor], tolerance: float, *, least_scale: float = 0.0
+) -> None:
+    """Compare tensors to within a fraction of the largest entry of each tensor.
+
+    Args:
+        results: the tensors to test, the loss (if there is one) before the gradients.
+        expected: the right tensors.
+        tolerance: allowed difference as a fraction of a tensor's scale, its largest entry.
+        least_scale: smallest scale as a fraction of the largest entry of all gradients. A small
+            gradient is a sum of larger terms that nearly cancel, so its rounding error in float32
+            does not shrink with it.
+    """
+    largest = max(right.abs().max().item() for right in expected[1:])
     for result, right in zip(results, expected, strict=True):
         assert result.shape == right.shape
-        scale = right.abs().max().item()
+        scale = max(right.abs().max().item(), least_scale * largest)
         difference = (result.to(DOUBLE) - right).abs().max().item()
         assert difference <= tolerance * (scale + 1e-9)
 
@@ -142,13 +154,13 @@ def test_kernel_and_pytorch_agree_with_stepwise_autograd(
         1e-10,
     )
     results = in_single_precision(network, sequences, chosen, initial)
-    assert_alike(results, expected, 1e-4)
+    assert_alike(results, expected, 3e-4, least_scale=1e-3)
 
 
 @pytest.mark.usefixtures("_compiled")
 @pytest.mark.parametrize("order", ["bottom_up", "literal"])
 def test_paper_network_in_single_precision(order: str) -> None:
-    """At the paper's sizes float32 itself is good for 1e-5."""
+    """At the paper's sizes float32 gives a relative accuracy of 1e-5."""
     config = NetworkConfig.model_validate({"update_order": order})
     network = network_of(config, limit=0.1)
     sequences = sequences_for(network, [70, 130, 101, 130, 125])
@@ -161,7 +173,7 @@ def test_paper_network_in_single_precision(order: str) -> None:
 @pytest.mark.usefixtures("_compiled")
 @pytest.mark.parametrize("order", ["bottom_up", "literal"])
 @pytest.mark.parametrize("shifted", [True, False])
-def test_gradients_are_added_as_backward_adds_them(order: str, shifted: bool) -> None:
+def test_gradients_are_accumulated_as_by_backward(order: str, shifted: bool) -> None:
     network = network_of(NetworkConfig.model_validate({"update_order": order}))
     sequences, chosen = sequences_for(network, [1, 40, 33, 7] * 5), torch.randperm(20)[:18]
     shift = torch.randn(18, sequences.seen.shape[2], dtype=DOUBLE) if shifted else None
@@ -178,8 +190,8 @@ def test_gradients_are_added_as_backward_adds_them(order: str, shifted: bool) ->
 
 
 @pytest.mark.usefixtures("_compiled")
-def test_small_activity_keeps_its_digits() -> None:
-    """The paper's initial range leaves activities of 1e-4, which count as much as large ones."""
+def test_small_activities_keep_their_relative_accuracy() -> None:
+    """With small initial weights activities are about 1e-4; their relative accuracy is the same."""
     network = network_of(NetworkConfig(), limit=1e-3)
     sequences = sequences_for(network, [50] * 3)
     chosen, initial = torch.arange(3), torch.zeros(3, 100, dtype=DOUBLE)
@@ -197,7 +209,7 @@ def test_second_derivatives_are_refused() -> None:
 
 
 @pytest.mark.usefixtures("_compiled")
-def test_without_gradients_the_same_loss() -> None:
+def test_the_loss_is_the_same_without_gradients() -> None:
     network = network_of(NetworkConfig())
     minibatch = Minibatch(sequences_for(network, [20, 7]), torch.tensor([1, 0]))
     with torch.no_grad():
@@ -214,13 +226,8 @@ def test_sequences_of_another_network_are_refused() -> None:
         divergence(network, Minibatch.of_all(sequences_for(other, [3])))
 
 
-def test_without_a_compiler_pytorch_computes_it(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: object, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CXX", raising=False)
-    monkeypatch.setenv("VMDNN_CACHE", str(tmp_path))
-    monkeypatch.setattr("learner.kernels.build.library_name", lambda: "never-compiled.so")
+@pytest.mark.usefixtures("no_compiler")
+def test_without_a_compiler_pytorch_computes_the_loss(caplog: pytest.LogCaptureFixture) -> None:
     learning_library.cache_clear()
     try:
         network = network_of(NetworkConfig())

@@ -30,7 +30,7 @@ def test_a_sequence_is_mixed_with_those_at_the_corners_of_a_cell_around_it() -> 
 
 
 @given(seed=st.integers(0, 2**31), index=st.integers(0, 8))
-def test_a_mixture_lies_where_its_weights_say(seed: int, index: int) -> None:
+def test_the_situation_of_a_mixture_follows_its_weights(seed: int, index: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     grid = NeighbourGrid(GRID, [10] * 9)
     mixtures = grid.mixtures(torch.full((50,), index), 1.0, generator)
@@ -54,7 +54,7 @@ def test_a_situation_off_the_grid_stays_as_it_is() -> None:
     assert corners(grid, 0) == {(0, 1, 3, 4)}
 
 
-def test_where_a_corner_is_missing_the_cell_is_flat() -> None:
+def test_a_missing_corner_reduces_the_dimension_of_the_cell() -> None:
     grid = NeighbourGrid(GRID[:5], [10] * 5)  # the lower row and two of the middle one
     assert corners(grid, 0) == {(0, 1, 3, 4)}
     assert (2, 2, 2, 2) not in corners(grid, 2)
@@ -67,7 +67,7 @@ def test_sequences_of_different_lengths_are_not_mixed() -> None:
     assert set(drawn(grid, 1).members.flatten().tolist()) == {1}
 
 
-def test_a_share_is_mixed_and_the_rest_stays() -> None:
+def test_only_the_given_fraction_is_mixed() -> None:
     mixtures = drawn(NeighbourGrid(GRID, [10] * 9), 4, share=0.3, draws=2000)
     kept = mixtures.weights[:, 0] == 1
     assert abs(kept.float().mean() - 0.7) < 0.05
@@ -112,7 +112,7 @@ def test_only_sequences_with_the_same_discrete_values_and_length_are_mixed(
 
 
 @given(situations=SITUATIONS, seed=st.integers(0, 2**31))
-def test_a_discrete_value_divides_the_grid_into_independent_ones(
+def test_a_discrete_variable_divides_the_grid_into_independent_grids(
     situations: list[dict[str, float | str]], seed: int
 ) -> None:
     """The mixtures of a group are those of a grid of its sequences alone."""
@@ -130,7 +130,7 @@ def test_a_discrete_value_divides_the_grid_into_independent_ones(
 
 
 @given(seed=st.integers(0, 2**31))
-def test_a_discrete_value_that_is_the_same_everywhere_changes_no_draw(seed: int) -> None:
+def test_a_constant_discrete_variable_changes_no_draw(seed: int) -> None:
     named = [{**situation, "object": "box"} for situation in GRID]
     mixtures = [
         NeighbourGrid(situations, [10] * 9).mixtures(
@@ -149,7 +149,7 @@ def test_without_continuous_values_nothing_is_mixed() -> None:
     assert mixtures.weights.tolist() == [[1.0], [1.0], [1.0]]
 
 
-def test_situations_with_other_values_are_never_neighbours() -> None:
+def test_situations_with_different_discrete_values_are_not_neighbours() -> None:
     grid = NeighbourGrid([*GRID, {"side": 0.2}, {"side": 0.25}, {"y": 0.2}], [10] * 12)
     assert corners(grid, 0) == {(0, 1, 3, 4)}
     assert corners(grid, 9) == {(9, 9, 10, 10)}, "flat along the value that it does not have"

@@ -14,13 +14,13 @@ def test_it_is_the_divergence_of_equation_5_per_step_and_value() -> None:
     assert loss.item() == pytest.approx(by_hand.item() / 2, rel=1e-5)
 
 
-def test_equal_distributions_have_none_even_with_zeros() -> None:
+def test_the_loss_of_equal_distributions_is_zero() -> None:
     certain = torch.tensor([0.0, 1.0]).view(1, 1, 1, 2)
     outputs = torch.log_softmax(torch.tensor([-200.0, 0.0]), 0).view(1, 1, 1, 2)
     assert kl_divergence(outputs, certain, torch.ones(1, 1)).item() == 0
 
 
-def test_masked_steps_count_for_nothing() -> None:
+def test_masked_steps_are_not_counted() -> None:
     outputs = torch.log_softmax(torch.randn(2, 3, 4, 5), -1)
     targets = torch.softmax(torch.randn(2, 3, 4, 5), -1)
     mask = torch.tensor([[1.0, 1, 1], [1, 0, 0]])

@@ -47,7 +47,7 @@ def test_the_classes_of_a_discrete_variable_are_its_choices(
 
 
 @given(st.floats(-100, 100), st.integers(2, 8))
-def test_label_between_two_classes_is_shared_in_proportion(value: float, count: int) -> None:
+def test_a_label_between_two_classes_is_divided_in_proportion(value: float, count: int) -> None:
     centres = np.linspace(-45, 45, count)
     label = soft_label(value, centres.tolist())
     assert label.sum() == pytest.approx(1, abs=1e-5)
@@ -72,7 +72,7 @@ def pretraining_of(
     return network, objective
 
 
-def test_only_the_window_of_each_sequence_is_asked_about() -> None:
+def test_only_the_window_of_each_sequence_has_labels() -> None:
     """The answer may come from the memory of earlier pictures, but is read only in the window."""
     mask = window_mask([10, 20], (0.75, 1.0))
     assert mask[0].nonzero().ravel().tolist() == [7, 8, 9]
@@ -80,7 +80,7 @@ def test_only_the_window_of_each_sequence_is_asked_about() -> None:
     assert window_mask([10], (0.2, 0.5))[0].nonzero().ravel().tolist() == [2, 3, 4]
 
 
-def test_vision_learns_to_tell_situations_apart(
+def test_vision_learns_to_distinguish_situations(
     small_config: Callable[..., Config],
     bar_episodes: Callable[..., Sequence[Episode]],
 ) -> None:

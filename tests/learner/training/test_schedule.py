@@ -1,4 +1,4 @@
-"""Every epoch lies in one round."""
+"""Every epoch belongs to exactly one round."""
 
 from __future__ import annotations
 

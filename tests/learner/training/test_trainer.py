@@ -50,7 +50,7 @@ def same_network(one: Trainer, other: Trainer) -> bool:
     )
 
 
-def test_it_learns_to_tell_situations_apart(
+def test_it_learns_to_distinguish_situations(
     store: TutoringStore, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:
     trainer = Trainer(
@@ -87,7 +87,7 @@ def test_stages_follow_each_other(store: TutoringStore, small_config: MakeConfig
     ]
 
 
-def test_coupled_training_leaves_the_vision_alone(
+def test_coupled_training_does_not_change_the_vision(
     store: TutoringStore, small_config: MakeConfig
 ) -> None:
     trainer = Trainer(VMDNNRecipe(small_config(pretraining=1, epochs=3), QUESTIONS), store)
@@ -151,7 +151,7 @@ def train_in_rounds(
 
 
 @pytest.mark.parametrize("interrupted_at", [2, 3, 4, 5, 6, 7])
-def test_training_can_be_resumed_anywhere_in_any_round(
+def test_training_can_be_resumed_at_any_epoch_of_any_round(
     tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes, interrupted_at: int
 ) -> None:
     config = small_config(pretraining=0, epochs=3, corrections={"epochs": 2})
@@ -176,9 +176,7 @@ def test_training_can_be_resumed_anywhere_in_any_round(
     assert resumed.policy_bytes(1) == whole.policy_bytes(1)
 
 
-def test_each_round_has_a_schedule_of_its_own(
-    store: TutoringStore, small_config: MakeConfig
-) -> None:
+def test_each_round_has_its_own_schedule(store: TutoringStore, small_config: MakeConfig) -> None:
     config = small_config(pretraining=0, epochs=20, corrections={"epochs": 20})
     trainer = Trainer(VMDNNRecipe(config, QUESTIONS), store, rounds=1)
 
@@ -194,7 +192,7 @@ def test_each_round_has_a_schedule_of_its_own(
         assert round_steps[19] < 0.1 * round_steps[2]
 
 
-def test_policies_of_each_round_know_what_they_learned_from(
+def test_policies_of_each_round_store_the_numbers_of_cases_and_sequences(
     store: TutoringStore, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:
     config = small_config(
@@ -221,7 +219,7 @@ def test_policies_of_each_round_know_what_they_learned_from(
     assert offline.epochs_total == 6
 
 
-def test_sequences_may_come_while_training_goes_on(
+def test_sequences_can_be_added_during_training(
     tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:
     config = small_config(pretraining=3, epochs=6)
@@ -252,7 +250,7 @@ def test_sequences_may_come_while_training_goes_on(
     assert same_network(resumed, trainer)
 
 
-def test_ranges_of_the_code_stay_as_they_were_when_coupled_training_began(
+def test_ranges_of_the_code_are_fixed_at_the_start_of_coupled_training(
     tmp_path: Path,
     small_config: MakeConfig,
     bar_episodes: MakeEpisodes,
@@ -273,7 +271,7 @@ def test_ranges_of_the_code_stay_as_they_were_when_coupled_training_began(
     )
 
 
-def test_pretraining_may_have_sequences_of_its_own(
+def test_pretraining_can_have_its_own_sequences(
     store: TutoringStore, tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:
     others = TutoringStore(tmp_path / "others")
@@ -286,7 +284,7 @@ def test_pretraining_may_have_sequences_of_its_own(
     assert trainer.sequences == 4
 
 
-def test_pretraining_waits_for_sequences_of_its_own(
+def test_pretraining_waits_for_its_own_sequences(
     store: TutoringStore, tmp_path: Path, small_config: MakeConfig
 ) -> None:
     trainer = Trainer(
@@ -311,7 +309,7 @@ def test_sequences_of_different_lengths(
     assert np.isfinite(train(trainer, 10)).all()
 
 
-def test_what_cannot_be_learned_from_is_refused(
+def test_sequences_that_cannot_be_learned_from_are_skipped(
     store: TutoringStore, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:
     episode = bar_episodes()[0]
@@ -326,7 +324,7 @@ def test_what_cannot_be_learned_from_is_refused(
     assert trainer.sequences == 4
 
 
-def test_none_can_be_learned_from(
+def test_without_usable_sequences_training_is_refused(
     tmp_path: Path, small_config: MakeConfig, bar_episodes: MakeEpisodes
 ) -> None:
     store = TutoringStore(tmp_path)
@@ -372,7 +370,7 @@ def test_more_epochs_prolong_a_finished_training(
     assert longer.finished
 
 
-def test_divergence_is_said_and_stops_the_training(
+def test_diverging_training_is_reported_and_stops(
     store: TutoringStore, small_config: MakeConfig
 ) -> None:
     trainer = Trainer(VMDNNRecipe(small_config(pretraining=0), QUESTIONS), store)

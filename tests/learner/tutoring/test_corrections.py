@@ -1,4 +1,4 @@
-"""A round of corrections: in which situations, for whom, and when it is over."""
+"""A round of corrections: its situations, the actors that get them, and its end."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def correction(make_episode: MakeEpisode) -> Callable[..., Episode]:
     return make
 
 
-def test_what_failed_in_practice_is_corrected(correction: Callable[..., Episode]) -> None:
+def test_failures_of_practice_are_corrected(correction: Callable[..., Episode]) -> None:
     round_ = make_round()
     assert ask(round_) is None
     round_.judge(verdict(1, PRECISE))
@@ -81,7 +81,7 @@ def test_what_failed_in_practice_is_corrected(correction: Callable[..., Episode]
     assert round_.kept == 2
 
 
-def test_a_good_policy_is_not_searched_for_failures_for_ever(
+def test_the_search_for_failures_of_a_good_policy_ends(
     correction: Callable[..., Episode],
 ) -> None:
     round_ = make_round()
@@ -99,14 +99,14 @@ def test_a_good_policy_is_not_searched_for_failures_for_ever(
 @pytest.mark.parametrize(
     "foreign", [{"policy_version": 6}, {"run_id": "before"}, {"task": "reaching"}]
 )
-def test_only_the_newest_policys_practice_counts(foreign: dict[str, Any]) -> None:
+def test_only_practice_of_the_newest_policy_counts(foreign: dict[str, Any]) -> None:
     round_ = make_round()
     round_.judge(verdict(2, **foreign))
     assert ask(round_) is None
     assert round_.judged == 0
 
 
-def test_only_who_holds_the_newest_policy_is_asked() -> None:
+def test_only_actors_with_the_newest_policy_get_corrections() -> None:
     round_ = make_round(choose="random")
     assert ask(round_, policy=("training", 6)) is None
     assert ask(round_, policy=("before", 7)) is None
@@ -114,7 +114,7 @@ def test_only_who_holds_the_newest_policy_is_asked() -> None:
     assert ask(round_) is not None
 
 
-def test_random_situations_are_the_same_after_a_restart_and_others_in_each_round() -> None:
+def test_random_situations_depend_on_the_round_only() -> None:
     first, again, second = (
         ask_all(make_round(number, choose="random", sequences=20)) for number in (1, 1, 2)
     )
@@ -125,7 +125,7 @@ def test_random_situations_are_the_same_after_a_restart_and_others_in_each_round
     assert all(dict(asked.situation) == dict(TASK.sample(asked.seed)) for asked in first)
 
 
-def test_tutored_cases_come_in_their_order() -> None:
+def test_tutored_cases_are_corrected_in_their_order() -> None:
     def cases(number: int, **given: Any) -> list[int]:
         asked = ask_all(make_round(number, choose="tutored", **given))
         assert all(dict(one.situation) == dict(TASK.tutored()[one.seed]) for one in asked)
@@ -137,7 +137,7 @@ def test_tutored_cases_come_in_their_order() -> None:
     assert make_round(choose="tutored", sequences=60).most == 45
 
 
-def test_the_situation_of_an_actor_that_is_gone_is_given_to_another() -> None:
+def test_the_situation_of_a_vanished_actor_is_assigned_to_another() -> None:
     round_ = make_round(choose="tutored")
     asked = ask(round_, "mortal")
     assert ask(round_, "other") != asked
@@ -145,7 +145,7 @@ def test_the_situation_of_an_actor_that_is_gone_is_given_to_another() -> None:
     assert ask(round_, "other") == asked
 
 
-def test_only_corrections_of_this_round_are_wanted_and_each_once(
+def test_only_corrections_of_this_round_are_accepted_and_each_once(
     correction: Callable[..., Episode],
 ) -> None:
     round_ = make_round(choose="tutored", sequences=1)
@@ -169,7 +169,7 @@ def test_only_corrections_of_this_round_are_wanted_and_each_once(
     assert round_.complete
 
 
-def test_a_correction_whose_simulation_fails_again_and_again_is_given_up(
+def test_a_correction_whose_simulation_fails_repeatedly_is_given_up(
     correction: Callable[..., Episode], failure: Callable[..., EpisodeFailed]
 ) -> None:
     round_ = make_round(choose="tutored", sequences=2)
@@ -187,7 +187,7 @@ def test_a_correction_whose_simulation_fails_again_and_again_is_given_up(
     assert (round_.kept, round_.most) == (1, 2)
 
 
-def test_what_fails_again_and_again_is_not_looked_for_again(
+def test_a_situation_that_was_given_up_is_not_chosen_again(
     failure: Callable[..., EpisodeFailed],
 ) -> None:
     round_ = make_round()
@@ -199,7 +199,7 @@ def test_what_fails_again_and_again_is_not_looked_for_again(
     assert ask(round_) is None
 
 
-def test_what_was_asked_for_before_a_restart_is_welcome(
+def test_corrections_requested_before_a_restart_are_accepted(
     correction: Callable[..., Episode],
 ) -> None:
     round_ = make_round()  # knows of no failure any more

@@ -1,4 +1,4 @@
-"""Every case is shown once, the clean executions first."""
+"""Every case is demonstrated once, executions without noise first."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_clean_executions_come_first() -> None:
     ]
 
 
-def test_all_cases_unless_some_are_named() -> None:
+def test_all_cases_are_planned_unless_some_are_named() -> None:
     assert curriculum(cases=None, repeats=4).size("experiment1") == 180
 
 
@@ -68,12 +68,12 @@ def test_cases_of_pretraining_come_before_all_others(make_episode: MakeEpisode) 
 
 
 @pytest.mark.parametrize("without", [{"epochs": 0}, {"task": None}])
-def test_pretraining_without_sequences_of_its_own(without: dict[str, Any]) -> None:
+def test_pretraining_without_its_own_sequences_plans_no_cases(without: dict[str, Any]) -> None:
     config = Config(learner=LearnerConfig(pretraining=PretrainingConfig(**without)))
     assert Curriculum(config, AVAILABLE).size("experiment1") == 180
 
 
-def test_what_was_shown_is_not_handed_out_again(make_episode: MakeEpisode) -> None:
+def test_demonstrated_cases_are_not_assigned_again(make_episode: MakeEpisode) -> None:
     plan = curriculum()
     shown = make_episode(kind=Kind.TUTORING, seed=case(7, 1).seed)
     assert plan.wants(shown)
@@ -84,7 +84,7 @@ def test_what_was_shown_is_not_handed_out_again(make_episode: MakeEpisode) -> No
     assert case(7, 1) not in [plan.next_case("a") for _ in range(4)]
 
 
-def test_the_case_of_an_actor_that_is_gone_is_handed_out_again() -> None:
+def test_the_case_of_a_vanished_actor_is_assigned_again() -> None:
     plan = curriculum()
     assert plan.next_case("mortal") == case(0, 0)
     assert plan.next_case("other") == case(7, 0)
@@ -92,7 +92,7 @@ def test_the_case_of_an_actor_that_is_gone_is_handed_out_again() -> None:
     assert plan.next_case("other") == case(0, 0)
 
 
-def test_only_the_tasks_own_tutored_cases_are_wanted(make_episode: MakeEpisode) -> None:
+def test_only_tutored_cases_of_the_task_are_accepted(make_episode: MakeEpisode) -> None:
     plan = curriculum()
     assert not plan.wants(make_episode(kind=Kind.TRIAL, seed=0))
     assert not plan.wants(make_episode(kind=Kind.TUTORING, seed=0, task="experiment9"))
@@ -100,7 +100,7 @@ def test_only_the_tasks_own_tutored_cases_are_wanted(make_episode: MakeEpisode) 
     assert plan.wants(make_episode(kind=Kind.TUTORING, seed=0))
 
 
-def test_an_episode_of_no_planned_case_is_refused(make_episode: MakeEpisode) -> None:
+def test_an_episode_of_an_unplanned_case_is_refused(make_episode: MakeEpisode) -> None:
     plan = curriculum()
     assert plan.refusal(make_episode(kind=Kind.TUTORING, seed=7001)) == ""
     plan.keep(make_episode(kind=Kind.TUTORING, seed=7001))
@@ -110,7 +110,7 @@ def test_an_episode_of_no_planned_case_is_refused(make_episode: MakeEpisode) -> 
     )
 
 
-def test_a_case_whose_simulation_fails_again_and_again_is_given_up(
+def test_a_case_whose_simulation_fails_repeatedly_is_given_up(
     failure: Callable[..., EpisodeFailed],
 ) -> None:
     plan = curriculum(cases=(0,), repeats=2)
@@ -127,7 +127,7 @@ def test_a_case_whose_simulation_fails_again_and_again_is_given_up(
     assert not plan.fail(failure("of-no-case", seed=5))
 
 
-def test_a_case_that_there_is_not_is_named() -> None:
+def test_an_unknown_case_is_named() -> None:
     with pytest.raises(UserError, match=r"no case 45; the task experiment1 has .* 0 to 44"):
         curriculum(cases=(3, 45))
     first = PretrainingConfig(task="reaching", cases=(15,))

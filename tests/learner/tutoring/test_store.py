@@ -12,9 +12,7 @@ from proto.episode import Episode
 MakeEpisodes = Callable[..., Sequence[Episode]]
 
 
-def test_sequences_are_there_again_after_a_restart(
-    tmp_path: Path, bar_episodes: MakeEpisodes
-) -> None:
+def test_sequences_are_kept_across_restarts(tmp_path: Path, bar_episodes: MakeEpisodes) -> None:
     store = TutoringStore(tmp_path / "tutoring")
     episodes = bar_episodes()
     assert [store.add(episode) for episode in episodes] == [True] * 4
@@ -28,7 +26,7 @@ def test_sequences_are_there_again_after_a_restart(
     assert known == sorted((episode.id, episode.seed, episode.kind) for episode in episodes)
 
 
-def test_the_same_sequence_is_kept_once(tmp_path: Path, bar_episodes: MakeEpisodes) -> None:
+def test_the_same_sequence_is_stored_once(tmp_path: Path, bar_episodes: MakeEpisodes) -> None:
     store = TutoringStore(tmp_path)
     episode = bar_episodes()[0]
     assert store.add(episode)
@@ -37,7 +35,7 @@ def test_the_same_sequence_is_kept_once(tmp_path: Path, bar_episodes: MakeEpisod
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_damaged_file_is_reported_and_may_be_replaced(
+def test_a_damaged_file_is_reported_and_can_be_replaced(
     tmp_path: Path, bar_episodes: MakeEpisodes, caplog: pytest.LogCaptureFixture
 ) -> None:
     good, bad, *_ = bar_episodes()

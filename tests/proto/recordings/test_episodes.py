@@ -1,4 +1,4 @@
-"""What a recording gives back is what was put in, or a message that says what to do."""
+"""An episode is read back unchanged, or an error says what to do."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def same(one: object, other: object) -> bool:
 
 @settings(max_examples=60)
 @given(episode=episodes())
-def test_every_field_comes_back_exactly(
+def test_every_field_is_read_back_exactly(
     episode: Episode, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("round") / "episode.mcap"
@@ -106,7 +106,7 @@ def test_every_field_comes_back_exactly(
         assert getattr(summary, item.name) == getattr(episode, item.name)
 
 
-def test_an_episode_without_states_is_recorded_as_before_there_were_any(
+def test_an_episode_without_states_has_no_states_in_its_file(
     tmp_path: Path, make_episode: MakeEpisode
 ) -> None:
     path = tmp_path / "episode.mcap"
@@ -115,8 +115,8 @@ def test_an_episode_without_states_is_recorded_as_before_there_were_any(
         summary = make_reader(stream).get_summary()
         assert summary is not None
         assert "/states" not in {channel.topic for channel in summary.channels.values()}
-        (told,) = (r.metadata for r in make_reader(stream).iter_metadata() if r.name == "episode")
-    assert "states" not in told
+        (texts,) = (r.metadata for r in make_reader(stream).iter_metadata() if r.name == "episode")
+    assert "states" not in texts
 
 
 def test_joint_names_agree_with_the_hand() -> None:
@@ -124,7 +124,7 @@ def test_joint_names_agree_with_the_hand() -> None:
     assert len(JOINT_NAMES) == 18
 
 
-def test_another_mcap_reader_understands_it(tmp_path: Path, make_episode: MakeEpisode) -> None:
+def test_another_mcap_reader_can_read_it(tmp_path: Path, make_episode: MakeEpisode) -> None:
     """With nothing but the file: index, schemas, times and metadata, as Foxglove reads them."""
     path, episode = tmp_path / "episode.mcap", make_episode()
     write_episode(path, episode)
@@ -165,7 +165,7 @@ def test_another_mcap_reader_understands_it(tmp_path: Path, make_episode: MakeEp
 
 @settings(max_examples=60)
 @given(data=st.data())
-def test_a_file_cut_off_anywhere_is_refused(
+def test_a_truncated_file_is_refused(
     data: st.DataObject, make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("cut") / "episode.mcap"
@@ -197,7 +197,7 @@ def test_a_flipped_byte_is_refused_or_harmless(
         assert getattr(summary, item.name) == getattr(episode, item.name)
 
 
-def test_what_is_no_recording_is_named(tmp_path: Path) -> None:
+def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="No such file"):
         read_episode(tmp_path / "missing.mcap")
     text = tmp_path / "notes.mcap"
@@ -230,7 +230,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path, make_episode: Mak
         write_episode(tmp_path / "file" / "episode.mcap", make_episode())
 
 
-def test_a_file_of_format_1_is_read_as_what_it_meant() -> None:
+def test_a_file_of_format_1_can_be_read() -> None:
     episode = read_episode(FORMAT_1 / "episode.mcap")
     assert (episode.id, episode.kind, episode.policy_version) == ("0123456789abcdef", Kind.TRIAL, 3)
     assert list(episode.phases) == list(range(8))
@@ -243,7 +243,7 @@ def test_a_file_of_format_1_is_read_as_what_it_meant() -> None:
     assert outcome.measures["obstacle_touched_at"] == Measure(30.0, "step")
 
 
-def test_a_file_of_a_newer_format_says_so(
+def test_a_file_of_a_newer_format_is_refused(
     tmp_path: Path, make_episode: MakeEpisode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "episode.mcap"

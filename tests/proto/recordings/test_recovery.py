@@ -1,4 +1,4 @@
-"""What was whole before a kill comes back; what was there before is never lost."""
+"""Recovery restores the complete records of a truncated file and never loses a file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def assert_is_start_of(part: Episode, whole: Episode) -> None:
 
 @settings(max_examples=60)
 @given(data=st.data())
-def test_a_file_cut_off_anywhere_keeps_its_whole_steps(
+def test_a_truncated_file_keeps_its_complete_steps(
     data: st.DataObject,
     recording: bytes,
     episode: Episode,
@@ -117,7 +117,9 @@ def _wait_for_part(target: Path, process: subprocess.Popen[bytes], size: int) ->
     return long_enough()[0]
 
 
-def test_a_repaired_episode_is_not_taken_for_a_whole_one(recording: bytes, tmp_path: Path) -> None:
+def test_a_recovered_episode_is_not_read_as_a_complete_one(
+    recording: bytes, tmp_path: Path
+) -> None:
     path = tmp_path / "episode.mcap"
     path.write_bytes(recording[: len(recording) // 2])
     assert main(["recover", str(path)]) == 0
@@ -138,7 +140,7 @@ def test_an_intact_file_is_left_alone(
     assert read_episode(copy).id == read_episode(path).id
 
 
-def test_a_repair_that_cannot_be_written_changes_nothing(
+def test_a_recovery_that_cannot_be_written_changes_nothing(
     recording: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, blocked = tmp_path / "episode.mcap", tmp_path / "folder"
@@ -151,7 +153,7 @@ def test_a_repair_that_cannot_be_written_changes_nothing(
 
 
 @pytest.mark.parametrize("content", [b"", b"not an MCAP file at all"])
-def test_what_holds_nothing_is_refused(
+def test_a_file_without_complete_messages_is_refused(
     content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "episode.mcap"

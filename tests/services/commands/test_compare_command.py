@@ -1,4 +1,4 @@
-"""One command trains VMDNN and the others, tests them, and says how each of them did."""
+"""`vmdnn compare` trains and tests VMDNN and other networks, and prints their results."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def everything(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_all_are_trained_tested_and_compared_and_nothing_is_done_twice(
+def test_networks_are_trained_tested_and_compared_and_nothing_is_repeated(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert compare(recordings, tmp_path, "--json") == 0
-    told: dict[str, Any] = json.loads(capsys.readouterr().out)
-    found = {each["name"]: each for each in told["contenders"]}
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    found = {each["name"]: each for each in result["contenders"]}
     assert list(found) == list(CONTENDERS)
     for name, each in found.items():
         assert each["trials"] == 1
@@ -68,7 +68,7 @@ def test_all_are_trained_tested_and_compared_and_nothing_is_done_twice(
         assert not np.ptp(still.targets[:, np.r_[NECK, FOCUS]], axis=0).any()
 
 
-def test_sequences_that_cannot_be_shown_again_are_refused(
+def test_sequences_that_cannot_be_repeated_are_refused(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = "--only fixed-gaze --set tutor.noise_deg=2"

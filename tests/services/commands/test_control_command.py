@@ -1,4 +1,4 @@
-"""`vmdnn control` reaches real processes, prints their answers, and says when nobody answers."""
+"""`vmdnn control` reaches real processes and prints their replies, or that there are none."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ class Processes:
 def processes(tmp_path: Path) -> Iterator[Processes]:
     endpoint = free_endpoint()
     words = ("--connect", endpoint, "--set", "run.name=controlled")
-    told: list[EvaluatorMetrics] = []
+    metrics: list[EvaluatorMetrics] = []
     with (
         listening_hub(endpoint, "--set", "run.name=controlled"),
         vmdnn("evaluator", *words, "--set", f"run.folder={tmp_path}") as evaluator,
         open_bus(HubConfig(endpoint=endpoint), "controlled", Role.WATCH, "w") as bus,
     ):
-        bus.subscribe(bus.keys.metrics(Role.EVALUATOR), told.append, EvaluatorMetrics)
-        eventually(lambda: bool(told), "the evaluator is ready")
+        bus.subscribe(bus.keys.metrics(Role.EVALUATOR), metrics.append, EvaluatorMetrics)
+        eventually(lambda: bool(metrics), "the evaluator is ready")
         yield Processes(endpoint, evaluator)
 
 
-def test_each_process_of_the_role_answers(processes: Processes) -> None:
+def test_each_process_of_the_role_replies(processes: Processes) -> None:
     assert processes.control("evaluator", "pause") == (0, "evaluator evaluator: paused\n", "")
     assert processes.control("evaluator", "resume") == (0, "evaluator evaluator: resumed\n", "")
     status, output, _ = processes.control("hub", "checkpoint", "--json")
@@ -55,7 +55,7 @@ def test_each_process_of_the_role_answers(processes: Processes) -> None:
     assert processes.evaluator.wait(PATIENCE_S) == 0
 
 
-def test_a_role_that_nobody_has_is_an_error_that_says_where_to_look(processes: Processes) -> None:
+def test_a_role_without_processes_is_an_error_with_advice(processes: Processes) -> None:
     status, output, errors = processes.control("recorder", "stop")
     assert (status, output) == (1, "")
     assert "no recorder of run 'controlled' replies" in errors

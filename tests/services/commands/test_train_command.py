@@ -1,4 +1,4 @@
-"""`vmdnn train` and `vmdnn inspect` as they are used."""
+"""The commands `vmdnn train` and `vmdnn inspect`."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def train(tmp_path: Path, data: Path) -> Callable[..., int]:
     return run
 
 
-def test_it_leaves_policies_a_checkpoint_and_the_config(
+def test_it_writes_policies_a_checkpoint_and_the_config(
     tmp_path: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -79,7 +79,7 @@ def test_it_leaves_policies_a_checkpoint_and_the_config(
     assert "is trained already" in capsys.readouterr().out
 
 
-def test_what_the_vision_tells_can_be_looked_at(
+def test_the_representation_of_the_vision_can_be_inspected(
     tmp_path: Path, data: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -93,11 +93,11 @@ def test_what_the_vision_tells_can_be_looked_at(
     assert main([*words, str(policy_file(out, 3)), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["sequences"], found["classifier"]) == (3, [])
-    assert {told["value"] for told in found["regression"]} == {"object_y_m", "object_yaw_deg"}
+    assert {score["value"] for score in found["regression"]} == {"object_y_m", "object_yaw_deg"}
 
 
 @pytest.mark.parametrize("pressed_at", [1, 5])
-def test_ctrl_c_saves_and_the_same_command_goes_on_exactly(
+def test_ctrl_c_saves_and_the_same_command_continues_exactly(
     tmp_path: Path,
     train: Callable[..., int],
     monkeypatch: pytest.MonkeyPatch,
@@ -141,7 +141,7 @@ def complaint_of(status: int, capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().err
 
 
-def test_folder_of_data_that_is_missing_or_empty(
+def test_a_missing_or_empty_data_folder_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     missing, empty, out = tmp_path / "missing", tmp_path / "empty", tmp_path / "run"
@@ -153,7 +153,7 @@ def test_folder_of_data_that_is_missing_or_empty(
     assert not out.exists()
 
 
-def test_data_of_which_nothing_can_be_read(
+def test_data_without_readable_sequences_are_refused(
     tmp_path: Path, data: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     for path in data.iterdir():
@@ -163,7 +163,7 @@ def test_data_of_which_nothing_can_be_read(
     assert "vmdnn recover" in complaint
 
 
-def test_run_of_another_network_is_left_as_it_was(
+def test_the_run_of_another_network_is_not_changed(
     tmp_path: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -174,7 +174,7 @@ def test_run_of_another_network_is_left_as_it_was(
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
 
 
-def test_inspect_network_prints_what_the_paper_says(capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_network_prints_the_sizes_of_the_paper(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", "network", "--json"]) == 0
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
     assert rows["mstnn_fast"] == {

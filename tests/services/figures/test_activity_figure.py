@@ -1,4 +1,4 @@
-"""What goes on in a network can be drawn for any rollout that its checkpoint played."""
+"""The activity of a network can be drawn for any rollout that its checkpoint played."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def rollouts(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> list
     return [folder / name / "trial0000.mcap" for name in ("with", "without")]
 
 
-def test_one_command_draws_two_rollouts_and_says_how_they_differ(
+def test_one_command_draws_two_rollouts_and_prints_their_difference(
     rollouts: list[Path], checkpoint: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "activity.png"
-    told = " ".join(map(str, rollouts))
-    command = f"figure activity --rollouts {told} --policy {checkpoint} --out {out} --json"
+    files = " ".join(map(str, rollouts))
+    command = f"figure activity --rollouts {files} --policy {checkpoint} --out {out} --json"
     assert main(command.split()) == 0
     assert out.read_bytes().startswith(b"\x89PNG")
     numbers = json.loads(capsys.readouterr().out)
@@ -54,7 +54,7 @@ def test_one_command_draws_two_rollouts_and_says_how_they_differ(
     assert {len(apart) for apart in numbers["difference_by_phase"].values()} == {8}
 
 
-def test_states_are_the_same_recorded_or_computed_from_what_was_seen(
+def test_recorded_states_equal_those_computed_from_the_pictures(
     rollouts: list[Path], checkpoint: Path
 ) -> None:
     episode = read_episode(rollouts[0])
@@ -66,7 +66,7 @@ def test_states_are_the_same_recorded_or_computed_from_what_was_seen(
     assert all(np.array_equal(recorded[name], computed[name]) for name in UNITS)
 
 
-def test_a_rollout_without_states_says_how_to_get_them(
+def test_for_a_rollout_without_states_the_error_says_what_to_do(
     rollouts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = f"figure activity --rollouts {rollouts[1]} --out {tmp_path / 'a.png'}"
@@ -85,7 +85,7 @@ def test_the_policy_of_another_rollout_is_refused(
         activity_of(read_episode(tmp_path / "foreign.mcap"), NetworkPolicy.from_file(checkpoint))
 
 
-def test_a_policy_without_states_and_a_file_that_is_no_png_are_named(
+def test_a_policy_without_states_and_a_file_name_other_than_png_are_refused(
     rollouts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = f"figure activity --rollouts {rollouts[0]} --out {tmp_path / 'a.png'} --policy tutor"
@@ -95,7 +95,7 @@ def test_a_policy_without_states_and_a_file_that_is_no_png_are_named(
     assert "ends in .png" in capsys.readouterr().err
 
 
-def test_rollouts_differ_in_the_phases_in_which_they_differ(
+def test_the_difference_of_rollouts_is_computed_for_each_phase(
     make_episode: Callable[..., Episode],
 ) -> None:
     episode = make_episode(6, phases=np.array([1, 1, 2, 2, 3, 3], np.uint8))

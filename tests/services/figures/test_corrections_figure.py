@@ -1,4 +1,4 @@
-"""The policies at the end of each round are tested and drawn, each trial played once."""
+"""The policies at the end of each round are tested and drawn; each trial is played once."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def test_the_policy_at_the_end_of_each_round_is_tested_once(
     command = f"figure corrections {run} --workers 1 --seed 7 --json --out {out}"
     assert main([*command.split(), "--trials", "1"]) == 0
     assert out.read_bytes().startswith(b"\x89PNG")
-    told: dict[str, Any] = json.loads(capsys.readouterr().out)
-    (only,) = told["runs"]
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    (only,) = result["runs"]
     assert (only["run"], only["choose"]) == (str(run), "random")
     policies = [
         (each["round"], each["policy_version"], each["cases"], each["sequences"], each["trials"])
@@ -68,7 +68,7 @@ def test_the_policy_at_the_end_of_each_round_is_tested_once(
     book = run / "evaluation" / "round_trials.jsonl"
     first = book.read_bytes()
     assert main([*command.split(), "--trials", "1"]) == 0
-    assert json.loads(capsys.readouterr().out) == told
+    assert json.loads(capsys.readouterr().out) == result
     assert book.read_bytes() == first
     assert main([*command.split(), "--trials", "2"]) == 0
     assert book.read_bytes().startswith(first)
@@ -80,7 +80,7 @@ def test_the_policy_at_the_end_of_each_round_is_tested_once(
     assert open_run(run).policies[0].logged() != before
 
 
-def test_what_cannot_be_drawn_is_named(
+def test_a_run_that_cannot_be_drawn_is_refused(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = f"figure corrections {run} --out {tmp_path / 'f.png'}"

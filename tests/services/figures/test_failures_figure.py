@@ -1,4 +1,4 @@
-"""The figure of failures tells a policy that snaps to what it was taught from one that does not."""
+"""The figure of failures distinguishes policies that snap to tutored values from others."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def write(path: Path, trials: Sequence[CountedTrial]) -> Path:
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 0.8])
 @pytest.mark.parametrize("name", [YAW, POSITION])
-def test_the_share_of_snapping_is_found_beside_other_errors(name: str, share: float) -> None:
+def test_snapping_is_estimated_in_the_presence_of_other_errors(name: str, share: float) -> None:
     random = np.random.default_rng(7)
     middle = {YAW: 0.0, POSITION: 0.25}
     noise = {YAW: 0.5, POSITION: 0.0005}
@@ -75,7 +75,7 @@ def test_the_share_of_snapping_is_found_beside_other_errors(name: str, share: fl
     assert found.half_width < 0.06
 
 
-def test_success_near_tutored_values_and_between_them_is_told_apart() -> None:
+def test_success_is_counted_near_and_between_tutored_values() -> None:
     found = numbers(Trials.of(play(nearest), TASK))
     for name in (YAW, POSITION):
         places = found["near_and_between"][name]
@@ -87,18 +87,18 @@ def test_success_near_tutored_values_and_between_them_is_told_apart() -> None:
         assert (bins[0]["from"], bins[-1]["to"]) == (min(GRID[name]), max(GRID[name]))
 
 
-def test_one_command_draws_what_evaluate_wrote(
+def test_one_command_draws_the_outcomes_of_evaluate(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, out = write(tmp_path / "outcomes.jsonl", play(nearest, 60)), tmp_path / "failures.png"
     assert main(f"figure failures --outcomes {path} --out {out} --json".split()) == 0
     assert out.read_bytes().startswith(b"\x89PNG")
-    told = json.loads(capsys.readouterr().out)
-    assert (told["policy"], told["policy_version"], told["trials"]) == ("run", 1, 60)
-    assert told["snapping"].keys() == {YAW, POSITION}
+    result = json.loads(capsys.readouterr().out)
+    assert (result["policy"], result["policy_version"], result["trials"]) == ("run", 1, 60)
+    assert result["snapping"].keys() == {YAW, POSITION}
 
 
-def test_recorded_rollouts_serve_as_well(
+def test_recorded_rollouts_can_be_drawn(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "failures.png"
@@ -107,7 +107,7 @@ def test_recorded_rollouts_serve_as_well(
     assert "snapping" in capsys.readouterr().out
 
 
-def test_versions_are_not_thrown_together(
+def test_trials_of_several_versions_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trials = [*play(nearest, 20), *play(nearest, 10, version=2)]
@@ -119,7 +119,9 @@ def test_versions_are_not_thrown_together(
     assert json.loads(capsys.readouterr().out)["trials"] == 10
 
 
-def test_what_holds_no_trials_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_without_trials_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "failures.png"
     (tmp_path / "other.jsonl").write_text('{"a": 1}\n')
     for words, message in (

@@ -27,7 +27,7 @@ def test_every_subject_is_shown_for_both_sides(
     assert cv2.imread(str(out)).std() > 20.0
 
 
-def test_of_one_subject_all_takes_are_shown() -> None:
+def test_all_takes_of_a_single_subject_are_shown() -> None:
     rows = gestures.rows_of(DrawnGestures(1, 4))
     assert [(row.subject, row.take) for row in rows] == [("0", take) for take in "0123"]
     assert len(gestures.draw(rows).axes) == 8

@@ -1,4 +1,4 @@
-"""Networks of several time constants are trained, tested and drawn, each of them once."""
+"""Networks with several time constants are trained, tested and drawn, each of them once."""
 
 from __future__ import annotations
 
@@ -29,22 +29,28 @@ def everything(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_one_command_trains_tests_and_draws_and_does_nothing_twice(
+def test_one_command_trains_tests_and_draws_and_repeats_nothing(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "five.png"
     assert draw(recordings, out) == 0
     assert out.read_bytes().startswith(b"\x89PNG")
-    told: dict[str, Any] = json.loads(capsys.readouterr().out)
-    assert [(each["tau"], each["trials"]) for each in told["time_constants"]] == [(30, 1), (150, 1)]
-    assert told["time_constants"][0]["against_150"].keys() == {"lenient", "strict", "precise"}
-    assert {tau: rate["successes"] for tau, rate in told["paper"].items()} == {"30": 32, "150": 44}
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    assert [(each["tau"], each["trials"]) for each in result["time_constants"]] == [
+        (30, 1),
+        (150, 1),
+    ]
+    assert result["time_constants"][0]["against_150"].keys() == {"lenient", "strict", "precise"}
+    assert {tau: rate["successes"] for tau, rate in result["paper"].items()} == {
+        "30": 32,
+        "150": 44,
+    }
     kept = everything(tmp_path / "five")
     saved = load_config(tmp_path / "five" / "tau30_seed1" / "config.yaml")
     assert (saved.network.pfc.tau, saved.run.seed) == (30, 1)
 
     assert draw(recordings, out) == 0
-    assert json.loads(capsys.readouterr().out) == told
+    assert json.loads(capsys.readouterr().out) == result
     assert everything(tmp_path / "five") == kept
 
     assert draw(recordings, out, "--trials 2 --tau 30") == 0
@@ -61,7 +67,7 @@ def test_one_command_trains_tests_and_draws_and_does_nothing_twice(
     assert "tau0.5" in capsys.readouterr().err
 
 
-def test_a_training_that_was_stopped_goes_on(recordings: Path, tmp_path: Path) -> None:
+def test_a_stopped_training_continues(recordings: Path, tmp_path: Path) -> None:
     values = {"learner": {"pretraining": {"epochs": 1}, "epochs": 2, "warmup_epochs": 1}}
     variant = sweeps.Variant("short", Config.model_validate(values))
     (run,) = sweeps.open_runs([variant], [1], tmp_path)
@@ -74,7 +80,7 @@ def test_a_training_that_was_stopped_goes_on(recordings: Path, tmp_path: Path) -
     assert done[-1] == sweeps.epochs_total(run)
 
 
-def test_the_interval_of_a_difference_is_newcombes() -> None:
+def test_the_interval_of_a_difference_is_that_of_newcombe() -> None:
     """The example of Newcombe's paper: 56 of 70 against 48 of 80."""
     low, high = difference95(Rate(56, 70), Rate(48, 80))
     assert (low, high) == (pytest.approx(0.0524, abs=1e-4), pytest.approx(0.3339, abs=1e-4))

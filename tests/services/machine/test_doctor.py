@@ -1,4 +1,4 @@
-"""`vmdnn doctor` finds what is wrong with a machine and says what to do."""
+"""`vmdnn doctor` finds the problems of a machine and advises what to do."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_problem_gives_status_1_and_advice(capsys: pytest.CaptureFixture[str])
     assert "choose another port with --set hub.endpoint=" in output
 
 
-def test_the_lock_is_installed_exactly() -> None:
+def test_the_locked_packages_are_installed_exactly() -> None:
     finding = check_locked_packages(LOCK)
     assert finding.ok, finding
 
@@ -63,7 +63,7 @@ def test_other_and_missing_packages_are_named(tmp_path: Path) -> None:
     assert str(lock) in finding.advice
 
 
-def test_without_a_lock_it_checks_what_the_distribution_requires(
+def test_without_a_lock_it_checks_the_requirements_of_the_distribution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("services.machine.doctor.LOCK", tmp_path / "requirements.lock")
@@ -73,7 +73,7 @@ def test_without_a_lock_it_checks_what_the_distribution_requires(
     assert "as vmdnn requires" in findings["packages"]["found"]
 
 
-def test_missing_and_unfit_requirements_are_named(
+def test_missing_and_wrong_requirements_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     metadata = tmp_path / "robots-1.0.dist-info" / "METADATA"
@@ -116,7 +116,7 @@ def test_the_chosen_backend_is_asked_about_graphics(
     assert "--set simulator.backend=" in unknown.advice
 
 
-def test_too_little_of_anything_is_a_problem(tmp_path: Path) -> None:
+def test_too_few_resources_are_a_problem(tmp_path: Path) -> None:
     assert not check_cores(1).ok
     assert check_cores(2).ok
     assert not check_memory(0.4).ok
@@ -135,11 +135,11 @@ def test_without_a_compiler_it_says_what_to_install(
 
 
 @pytest.mark.parametrize("host", ["192.0.2.1", "no.such.host.invalid"])
-def test_an_endpoint_that_is_not_ours_is_a_problem(host: str) -> None:
+def test_an_endpoint_of_another_machine_is_a_problem(host: str) -> None:
     assert "an address of this machine" in check_port(f"tcp/{host}:7447").advice
 
 
-def test_the_lock_holds_what_the_project_asks_for() -> None:
+def test_the_lock_contains_the_requirements_of_the_project() -> None:
     locked = read_lock(LOCK)
     assert locked["torch"] == "2.13.0"
     assert "opencv-python" not in locked, "it overwrites opencv-python-headless"

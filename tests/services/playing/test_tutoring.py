@@ -1,4 +1,4 @@
-"""Tutored cases are recorded as they were asked for, and a stopped recording is carried on."""
+"""The requested cases are recorded, and a stopped recording can be continued."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def written(path: Path) -> tuple[int, int]:
     return status.st_ino, status.st_mtime_ns
 
 
-def test_a_stopped_recording_is_carried_on(
+def test_a_stopped_recording_is_continued(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "stopped"
@@ -73,7 +73,7 @@ def test_a_stopped_recording_is_carried_on(
         assert np.array_equal(again.images, before.images)
 
 
-def test_another_tutor_is_not_mixed_in(
+def test_a_folder_of_another_tutor_is_refused(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "other"
@@ -94,14 +94,14 @@ def test_cases_can_be_listed(text: str, cases: list[int]) -> None:
     assert [case.situation for case in listed] == [task.tutored()[case] for case in cases]
 
 
-def test_more_random_cases_are_the_same_and_others() -> None:
+def test_more_random_cases_include_the_fewer_ones() -> None:
     few, more = (parse_cases(f"random:{count}", REACHING, seed=500) for count in (2, 4))
     assert more[:2] == few
     assert [case.name for case in more] == [f"random00050{i}" for i in range(4)]
     assert [case.situation for case in more] == [REACHING.sample(500 + i) for i in range(4)]
 
 
-def test_random_cases_are_recorded_where_others_were(tmp_path: Path) -> None:
+def test_random_cases_can_be_added_to_a_recording(tmp_path: Path) -> None:
     command = f"tutor --task reaching --seed 7 --repeats 2 --workers 1 --out {tmp_path}".split()
     assert main([*command, "--cases", "14"]) == 0
     assert main([*command, "--cases", "random:1"]) == 0
@@ -121,7 +121,7 @@ def test_random_cases_are_recorded_where_others_were(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["", "some", "45", "1,99", "-1", "3-", "5-2", "random", "random:0", "random:x"]
 )
-def test_cases_that_are_not_there_are_refused(text: str) -> None:
+def test_cases_that_do_not_exist_are_refused(text: str) -> None:
     with pytest.raises(UserError, match="--cases"):
         parse_cases(text, TASK, seed=0)
 

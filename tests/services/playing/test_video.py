@@ -1,4 +1,4 @@
-"""A replay is a video with one frame a step that shows the episode."""
+"""A replay is a video of the episode with one frame for each step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from proto.recordings.episodes import read_episode, write_episode
 from services.cli import main
 
 STEPS = (0, 60, 120)
-"""Rendering takes a while: the tests replay these steps of an episode only."""
+"""Steps of an episode that the tests replay; rendering all would take long."""
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +78,7 @@ def test_the_recorded_picture_agrees_with_the_rendered_view(short: Path, tmp_pat
     assert np.abs(small.astype(int) - episode.images[0][5:30, :40]).mean() < 12
 
 
-def test_a_recovered_episode_can_be_seen(recordings: Path, tmp_path: Path) -> None:
+def test_a_recovered_episode_can_be_replayed(recordings: Path, tmp_path: Path) -> None:
     path, out = tmp_path / "cut.mcap", tmp_path / "cut.mp4"
     whole = (recordings / "case03_repeat00.mcap").read_bytes()
     path.write_bytes(whole[: len(whole) // 8])
@@ -102,7 +102,7 @@ class Blue(SapienSimulator):
 """
 
 
-def test_an_episode_of_a_backend_of_ones_own_is_replayed_with_it(
+def test_an_episode_of_a_users_backend_is_replayed_with_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""Rates read the same wherever they are shown."""
+"""Rates have the same text in all tables."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def test_a_rate_is_shown_with_its_wilson_interval() -> None:
     assert rate_text(Rate(0, 0)) == "0.0 (0.0 to 100.0)", "nothing was tried"
 
 
-def test_parts_of_it_can_be_shown_alone() -> None:
+def test_rate_and_interval_can_be_shown_alone() -> None:
     assert percent_text(0.125) == "12.5"
     assert interval_text((0.391, 0.862), digits=0) == "39 to 86"
 

@@ -25,7 +25,7 @@ def shown(view: RunView) -> str:
     return console.file.getvalue()
 
 
-def test_tables_show_what_each_process_told() -> None:
+def test_tables_show_the_metrics_of_each_process() -> None:
     text = shown(view_of(ACTOR, LEARNER, EVALUATOR))
     for expected in ("a-1", "81.2", "trial: moved_object", "120/2500", "0.4321", "12.5"):
         assert expected in text
@@ -34,7 +34,7 @@ def test_tables_show_what_each_process_told() -> None:
     assert text.index("44 of 52") < text.index("3 of 10"), "the newest policy comes first"
 
 
-def test_tables_show_who_vanished_and_of_many_actors_only_some() -> None:
+def test_tables_show_vanished_processes_and_a_part_of_many_actors() -> None:
     many = view_of(*(replace(ACTOR, id=f"a-{number:02}") for number in range(40)))
     gone = replace(many, vanished_s={(Role.ACTOR, "a-07"): time.time()})
     text = shown(gone)
@@ -43,7 +43,7 @@ def test_tables_show_who_vanished_and_of_many_actors_only_some() -> None:
     assert "39 actors" in text
 
 
-def test_a_line_says_it_all_briefly() -> None:
+def test_one_line_summarizes_the_run() -> None:
     assert run_line(view_of(ACTOR, LEARNER, EVALUATOR)) == (
         "learner coupled, epoch 120/2500, loss 0.4321, 45 sequences, 12.5 epochs/s, policy 3"
         " | 1 actor, 81 steps/s, 17 episodes | policy 3 strict 44 of 52, 85 % (72 to 92)"
@@ -62,18 +62,18 @@ def test_a_line_says_it_all_briefly() -> None:
         ({"stage": Stage.FINISHED, "round": 2}, "finished"),
     ],
 )
-def test_what_the_learner_is_at(given: dict[str, Any], said: str) -> None:
+def test_the_stage_of_the_learner_is_shown(given: dict[str, Any], said: str) -> None:
     view = view_of(replace(LEARNER, **given))
     assert run_line(view).startswith(f"learner {said}, epoch")
     assert f" {said} " in shown(view)
 
 
-def test_a_view_of_nothing_can_be_shown() -> None:
+def test_an_empty_view_can_be_shown() -> None:
     assert run_line(view_of()) == "0 actors, 0 steps/s, 0 episodes"
     assert RUN in shown(view_of())
 
 
-def test_what_went_wrong_is_shown() -> None:
+def test_problems_are_shown() -> None:
     view = view_of(replace(ACTOR, put_aside=3), replace(LEARNER, given_up=2))
     assert "2, 3 put aside" in shown(view)
     assert "2 given up" in run_line(view)

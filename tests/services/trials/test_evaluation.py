@@ -1,4 +1,4 @@
-"""An evaluation prints what was agreed, on the same situations whoever is tested and however."""
+"""`vmdnn evaluate`: its output, and that every policy is tested in the same situations."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def evaluate(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
     return result
 
 
-def test_the_json_is_what_was_agreed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_json_has_the_documented_fields(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["--policy", "replay", "--task", "experiment1", "--trials", "3", "--seed", "11"]
     result = evaluate(capsys, *words)
     assert result.keys() == {
@@ -50,7 +50,7 @@ def test_the_json_is_what_was_agreed(capsys: pytest.CaptureFixture[str]) -> None
     assert result | {"wall_s": None} == again | {"wall_s": None}
 
 
-def test_without_json_it_is_a_table(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_json_it_prints_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "--policy", "tutor", "--trials", "1", "--workers", "1"]) == 0
     printed = capsys.readouterr()
     assert "precise" in printed.out
@@ -58,7 +58,7 @@ def test_without_json_it_is_a_table(capsys: pytest.CaptureFixture[str]) -> None:
     assert "evaluating tutor" in printed.err
 
 
-def test_rollouts_are_kept_with_the_seeds_situations(
+def test_rollouts_are_recorded_in_the_situations_of_the_seed(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     result = evaluate(capsys, *f"--policy lookup --trials 2 --seed 40 --out {tmp_path}".split())
@@ -69,7 +69,7 @@ def test_rollouts_are_kept_with_the_seeds_situations(
     assert kept[0].images.any(), "what is kept is seen, even if the policy does not look"
 
 
-def test_pictures_and_workers_change_nothing(tmp_path: Path) -> None:
+def test_rendering_and_workers_do_not_change_episodes(tmp_path: Path) -> None:
     """Physics alone, with pictures, and in two processes: the same episodes."""
     config = Config()
     blind = by_seed(config, workers=1)
@@ -106,7 +106,7 @@ def test_given_situations_are_played_and_their_states_kept(
     assert all(np.array_equal(again[name], episode.states[name]) for name in units)
 
 
-def test_outcomes_are_kept_without_rollouts(
+def test_outcomes_can_be_saved_without_rollouts(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "outcomes.jsonl"
@@ -125,7 +125,7 @@ def by_seed(config: Config, workers: int, folder: Path | None = None) -> dict[in
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_policy_that_is_not_there_is_named(workers: int) -> None:
+def test_an_unknown_policy_is_named(workers: int) -> None:
     config = Config()
     with pytest.raises(UserError, match="no such policy"):
         list(play_all(config, "missing.safetensors", trial_jobs(config, 2, 1), workers=workers))
@@ -135,7 +135,7 @@ def test_a_policy_that_is_not_there_is_named(workers: int) -> None:
     ("words", "message"),
     [
         ("--policy nobody --trials 1", "no such policy"),
-        ("--policy tutor --backend nothing", "there is no 'nothing'"),
+        ("--policy tutor --backend nothing", "simulator.backend: there is no 'nothing'"),
         ("--policy tutor --task experiment9", "task.name"),
         ("--policy tutor --set tutor.speed=3", "tutor.speed"),
         ("--policy tutor --situation object_y_m", "write NAME=VALUE"),

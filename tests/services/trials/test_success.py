@@ -1,4 +1,4 @@
-"""Rates and intervals are the textbook's; every outcome is counted once in each reading."""
+"""Rates and intervals are correct; every outcome is counted once in each reading."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def test_the_interval_agrees_with_scipy(counts: tuple[int, int]) -> None:
 
 def test_a_tally_counts_each_reading_and_reason() -> None:
     tally = Tally.of([PRECISE] * 5 + [IMPRECISE] * 2 + [TOUCHED] + [NOT_LIFTED] * 2)
-    told = json.loads(json.dumps(tally.as_json()))
-    assert told["trials"] == 10
-    assert [told[reading]["successes"] for reading in READINGS] == [8, 7, 5]
-    assert [told[reading]["rate"] for reading in READINGS] == [0.8, 0.7, 0.5]
-    assert told["strict"]["wilson95"] == pytest.approx(wilson95(7, 10))
-    assert told["reasons"] == {"imprecise": 2, "touched_obstacle": 1, "not_lifted": 2}
+    result = json.loads(json.dumps(tally.as_json()))
+    assert result["trials"] == 10
+    assert [result[reading]["successes"] for reading in READINGS] == [8, 7, 5]
+    assert [result[reading]["rate"] for reading in READINGS] == [0.8, 0.7, 0.5]
+    assert result["strict"]["wilson95"] == pytest.approx(wilson95(7, 10))
+    assert result["reasons"] == {"imprecise": 2, "touched_obstacle": 1, "not_lifted": 2}
 
 
-def test_an_empty_tally_claims_nothing() -> None:
-    told = Tally().as_json()
-    assert told["strict"] == {"successes": 0, "rate": 0.0, "wilson95": [0.0, 1.0]}
-    assert told["reasons"] == {}
+def test_an_empty_tally_has_the_widest_interval() -> None:
+    result = Tally().as_json()
+    assert result["strict"] == {"successes": 0, "rate": 0.0, "wilson95": [0.0, 1.0]}
+    assert result["reasons"] == {}

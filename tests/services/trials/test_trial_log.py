@@ -1,4 +1,4 @@
-"""Each trial counts once, whatever is killed and started again."""
+"""Each trial is counted once, also when processes are killed and started again."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_trial_counts_once_for_each_policy(tmp_path: Path, trial: Callable[...
 
 
 @pytest.mark.parametrize("kept", [1, 40, -1])
-def test_a_line_cut_off_by_a_kill_is_dropped_and_counted_anew(
+def test_an_incomplete_line_is_dropped_and_counted_again(
     tmp_path: Path, trial: Callable[..., Rollout], kept: int
 ) -> None:
     path = tmp_path / "trials.jsonl"
@@ -59,7 +59,7 @@ def test_a_line_cut_off_by_a_kill_is_dropped_and_counted_anew(
     assert sorted(TrialLog(path).outcomes("run", 1)) == [1, 2]
 
 
-def test_a_damaged_line_is_skipped_and_told(
+def test_a_damaged_line_is_skipped_and_reported(
     tmp_path: Path, trial: Callable[..., Rollout], caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "trials.jsonl"
@@ -72,7 +72,7 @@ def test_a_damaged_line_is_skipped_and_told(
     assert "line 2 is not counted: outcome" in caplog.text
 
 
-def test_lines_of_format_1_are_read_as_what_they_meant(tmp_path: Path) -> None:
+def test_lines_of_format_1_can_be_read(tmp_path: Path) -> None:
     old = Path(__file__).parents[2] / "data" / "format1" / "trials.jsonl"
     touched, precise = read_trials(old)
     assert touched.outcome.reason == "touched_obstacle"
@@ -83,7 +83,9 @@ def test_lines_of_format_1_are_read_as_what_they_meant(tmp_path: Path) -> None:
     assert sorted(TrialLog(path).outcomes("run", 3)) == [3001, 3002]
 
 
-def test_lines_of_a_newer_format_say_so(tmp_path: Path, trial: Callable[..., Rollout]) -> None:
+def test_lines_of_a_newer_format_are_reported(
+    tmp_path: Path, trial: Callable[..., Rollout]
+) -> None:
     path = tmp_path / "trials.jsonl"
     TrialLog(path).add(trial(5))
     path.write_text(path.read_text().replace('"format": 2', '"format": 3'))

@@ -1,4 +1,4 @@
-"""Drawn clips: seeded, different from each other, and legible."""
+"""Drawn clips are seeded and different, and their sides can be recognized."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Clips from videos of the user's own."""
+"""Clips from a user's videos."""
 
 import cv2
 import numpy as np
@@ -51,7 +51,7 @@ def test_a_folder_lists_its_takes_by_name(folder):
     )
 
 
-def test_takes_are_as_many_as_both_sides_have(folder):
+def test_takes_are_those_that_exist_for_both_sides(folder):
     (folder / "picture-right" / "b.avi").unlink()
     assert RecordedGestures(folder).takes == ("0",)
 
@@ -79,7 +79,7 @@ def test_a_missing_or_empty_side_is_refused(folder):
         RecordedGestures(folder)
 
 
-def test_a_file_that_is_no_video_is_refused(folder):
+def test_a_file_that_is_not_a_video_is_refused(folder):
     bad = folder / "picture-left" / "notes.txt"
     bad.write_text("to do: film the left side")
     with pytest.raises(GestureVideoError, match=r"notes\.txt: cannot be read as a video"):

@@ -78,7 +78,7 @@ def test_attention_follows_the_subtasks():
     assert (actions[task.phases == 7][:, GRASP] == 10.0).all()
 
 
-def test_gaze_centres_what_the_neck_can_reach():
+def test_gaze_follows_the_point():
     gaze = Gaze(TABLE_DROP_M)
     straight = gaze.neck_deg(np.array([0.0, 0.6, 0.0]))
     right = gaze.neck_deg(np.array([0.3, 0.6, 0.0]))
@@ -89,7 +89,7 @@ def test_gaze_centres_what_the_neck_can_reach():
     assert below[0] < straight[0] - 5.0
 
 
-def test_fitted_postures_are_those_that_lie_in_the_repository():
+def test_fitting_gives_the_postures_in_the_repository():
     fitted, stored = PostureFitter().fit(), load_key_postures()
     for postures in ("object", "obstacle"):
         for name, rows in getattr(stored, postures).items():

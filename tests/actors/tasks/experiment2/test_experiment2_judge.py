@@ -1,4 +1,4 @@
-"""What counts as success in Experiment II."""
+"""The readings of success in Experiment II."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def moved_pose(pose, offset=(0.0, 0.0, 0.0), tilt_deg=0.0):
 
 
 def hand_at(pose, hand_yaw=0.0, along=0.0, across=0.0):
-    """A hand that would grasp a box exactly, displaced as told (m, degrees)."""
+    """Return the pose of a hand that grasps a box exactly, displaced (m, degrees)."""
     turn = Rotation.from_quat(np.roll(pose.quaternion, -1))
     to_axis = Rotation.align_vectors(
         [[1, 0, 0], [0, 0, -1]], [GRASP_AXIS, np.cross(GRASP_AXIS, [0, -1, 0])]
@@ -71,7 +71,7 @@ def readings(outcome):
     return (outcome.lenient, outcome.strict, outcome.precise)
 
 
-def test_a_right_grasp_is_precise():
+def test_a_correct_grasp_is_precise():
     outcome = judged()
     assert readings(outcome) == (True, True, True)
     assert outcome.reason == NO_FAILURE
@@ -83,7 +83,7 @@ def test_a_right_grasp_is_precise():
 @pytest.mark.parametrize(
     "hand", [{"hand_yaw": 9.0}, {"hand_yaw": -9.0}, {"along": 0.017}, {"across": -0.012}]
 )
-def test_a_hand_placed_wrong_is_strict_but_imprecise(hand):
+def test_a_wrongly_placed_hand_is_strict_but_imprecise(hand):
     outcome = judged(bodies(**hand))
     assert readings(outcome) == (True, True, False)
     assert outcome.reason == "imprecise"
@@ -98,13 +98,13 @@ def test_a_hand_placed_wrong_is_strict_but_imprecise(hand):
         ({"at": "other"}, "wrong_object"),
     ],
 )
-def test_what_went_wrong_before_the_hand_closed_is_lenient_only(before, reason):
+def test_failures_before_the_hand_closed_are_lenient_only(before, reason):
     outcome = judged(bodies(**before))
     assert readings(outcome) == (True, False, False)
     assert outcome.reason == reason
 
 
-def test_the_other_object_lifted_is_the_wrong_one():
+def test_lifting_the_other_object_is_a_failure():
     outcome = judged(after=bodies(other=(0.0, 0.0, 0.1)))
     assert readings(outcome) == (False, False, False)
     assert outcome.reason == "wrong_object"
@@ -113,7 +113,7 @@ def test_the_other_object_lifted_is_the_wrong_one():
     assert readings(judged(after=both)) == (True, False, False)
 
 
-def test_knocking_the_other_over_while_lifting_counts():
+def test_knocking_over_the_other_object_while_lifting_is_a_failure():
     outcome = judged(after=bodies(indicated=(0.0, 0.0, 0.1), other=(0.03, 0.0, -0.02)))
     assert outcome.reason == "other_moved"
     assert outcome.value("other_moved_mm") == pytest.approx(np.hypot(30.0, 20.0))

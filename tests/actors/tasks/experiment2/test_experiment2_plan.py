@@ -74,12 +74,12 @@ def test_neighbouring_situations_have_neighbouring_plans(situation, name):
 
 @given(situations)
 @settings(max_examples=10)
-def test_plan_depends_on_nothing_but_the_indicated_object(situation):
+def test_plan_depends_only_on_the_indicated_object(situation):
     other = {"other_kind": "laying", "other_y_m": 0.25, "other_yaw_deg": 3.0, "take": "11"}
     np.testing.assert_array_equal(plan(situation), plan({**situation, **other}))
 
 
-def test_until_the_head_turns_plans_tell_nothing_about_the_situation():
+def test_plans_are_equal_until_the_head_turns():
     plans = [plan(situation) for situation in TASK.tutored()]
     for actions in plans:
         first = actions[: BEGINS["attend object"]]
@@ -103,7 +103,7 @@ def test_attention_follows_the_subtasks():
 
 @pytest.mark.parametrize("family", FAMILIES, ids=" ".join)
 @pytest.mark.slow
-def test_fitted_postures_are_those_that_lie_in_the_repository(family):
+def test_fitting_gives_the_postures_in_the_repository(family):
     fitted, stored = FamilyFitter(family).fit(), load_key_postures().families[family]
     np.testing.assert_allclose(fitted.passing, stored.passing, atol=0.05)
     for name in POSTURES:

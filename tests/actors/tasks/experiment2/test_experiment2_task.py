@@ -78,7 +78,7 @@ def test_a_delay_moves_the_windows_of_the_questions():
         assert [round(200 * share) for share in delayed.window] == [first + shift, last + 52]
 
 
-def test_the_first_eight_tutored_cases_are_the_papers():
+def test_the_first_eight_tutored_cases_are_those_of_the_paper():
     cases = TASK.tutored()[:8]
     assert len({case_of(case) for case in cases}) == 8
     for case in cases:
@@ -99,7 +99,7 @@ def test_tutored_cases_cover_kinds_poses_and_clips_evenly():
     assert cases == experiment2().tutored()
 
 
-def test_more_poses_give_more_situations_none_of_them_twice():
+def test_more_poses_give_more_different_situations():
     cases = experiment2(poses=18).tutored()
     without_clip = [tuple(v for k, v in c.items() if k not in {"subject", "take"}) for c in cases]
     assert len(set(without_clip)) == len(cases) == 144
@@ -125,7 +125,7 @@ def test_trials_can_show_new_subjects():
         task.check(situation)
 
 
-def test_corners_are_those_of_the_ranges_in_every_case():
+def test_corners_combine_the_ends_of_the_ranges_with_every_case():
     corners = TASK.corners()
     assert len(corners) == 8 * 2**4
     assert {corner["take"] for corner in corners} == {"10"}
@@ -161,7 +161,7 @@ def test_the_screen_shows_the_clip_of_the_indicated_side_and_then_is_dark(place,
     assert screen.size_m == (1.0, 1.0)
 
 
-def test_objects_stand_at_their_places_on_the_table_in_shades_of_their_own():
+def test_objects_stand_at_their_places_in_different_shades():
     situation = {
         **TASK.sample(2), "indicated_x_m": "0.07", "indicated_kind": "standing",
         "indicated_y_m": 0.27, "indicated_yaw_deg": 10.0, "other_kind": "laying",
@@ -176,7 +176,7 @@ def test_objects_stand_at_their_places_on_the_table_in_shades_of_their_own():
     assert indicated.colour != other.colour
 
 
-def test_videos_of_the_users_own_are_tutored_and_tested(tmp_path):
+def test_a_users_videos_are_tutored_and_tested(tmp_path):
     for side in ("picture-left", "picture-right"):
         (tmp_path / side).mkdir()
         for number in range(2):
@@ -194,7 +194,7 @@ def test_videos_of_the_users_own_are_tutored_and_tested(tmp_path):
         TASK.scene(trial)
 
 
-def test_baselines_see_nothing_of_what_they_are_blind_to():
+def test_baselines_ignore_the_variables_they_are_blind_to():
     situation = {**TASK.sample(4), "indicated_x_m": "0.07"}
     negative = TASK.baselines["always-negative-x"](situation)
     assert negative["indicated_x_m"] == "-0.15"
