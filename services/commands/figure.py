@@ -10,7 +10,14 @@ from typing import Final, Protocol
 
 from rich.console import Console
 
-from services.commands.figures import activity, corrections, failures, gestures, time_constants
+from services.commands.figures import (
+    activity,
+    corrections,
+    failures,
+    gestures,
+    time_constants,
+    trajectories,
+)
 from services.figures.figure_result import FigureResult
 from services.figures.style import check_name, save
 
@@ -29,6 +36,7 @@ class FigureCommand(Protocol):
 
 FIGURES: Final[Mapping[str, FigureCommand]] = {
     "activity": activity,
+    "trajectories": trajectories,
     "time-constants": time_constants,
     "failures": failures,
     "corrections": corrections,

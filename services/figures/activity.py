@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
 
@@ -15,16 +14,20 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
-from actors.policies.contract import StatefulPolicy
 from learner.network.subnets import ACTIVATION_GAIN
 from proto.body import ACTION_NAMES, ARM, FOCUS, GRASP, NECK
-from proto.episode import Episode, Floats, States
-from proto.errors import UserError
-from proto.variables import Value
-from services.figures.style import BLACK, figure_style, words_and_unit
+from services.figures.rollouts import (
+    SYMBOLS,
+    Activity,
+    common_phase_starts,
+    distinctions,
+    numbered_phases,
+    wrapped,
+)
+from services.figures.style import BLACK, figure_style
 
-SUBNETS: Final[Mapping[str, str]] = {"mstnn_fast": "V_F", "pfc": "PFC", "mtrnn_fast": "M_F"}
-"""The subnets that the figure shows, with the paper's symbol of each."""
+SUBNETS: Final = ("mstnn_fast", "pfc", "mtrnn_fast")
+"""The subnets that the figure shows."""
 UNITS_SHOWN: Final = 50
 """Largest number of units shown of a subnet: those that vary most."""
 OUTPUTS: Final[Mapping[str, slice]] = {
@@ -33,60 +36,14 @@ OUTPUTS: Final[Mapping[str, slice]] = {
     "grasp\nlevel": slice(GRASP, GRASP + 1),
     "focus\nlevel": slice(FOCUS, FOCUS + 1),
 }
-_SAME_OUTPUTS: Final = 1e-3
-"""Largest difference by rounding between the outputs of a network that sees the same pictures."""
+TITLE_WIDTH: Final = 44
+"""Largest number of characters in a line of a column's title."""
+CAPTION_WIDTH: Final = 60
+"""Largest number of characters in a line of the caption, for each column."""
 _RANGES: Final[Mapping[str, tuple[float, float]]] = {
     "grasp\nlevel": (0.5, 10.5),
     "focus\nlevel": (0.0, 21.0),
 }
-
-
-@dataclass(frozen=True)
-class Activity:
-    """An episode of T steps with the activity of the network.
-
-    Attributes:
-        episode: the episode.
-        states: activity (T, units) of each subnet by name.
-    """
-
-    episode: Episode
-    states: States
-
-    @property
-    def phase_starts(self) -> NDArray[np.int64]:
-        """First step of each phase, followed by T."""
-        phases = self.episode.phases
-        starts = np.flatnonzero(np.diff(phases)) + 1
-        return np.concatenate([[0], starts, [len(phases)]])
-
-
-def activity_of(episode: Episode, policy: StatefulPolicy | None) -> Activity:
-    """Return an episode with its states.
-
-    Args:
-        episode: the episode.
-        policy: the policy that played it. It sees the pictures again to compute the states. If
-            None, the recorded states are used.
-
-    Raises:
-        UserError: there is neither a policy nor a recorded state, or another policy played the
-            episode.
-    """
-    if episode.states is not None and policy is None:
-        states = episode.states
-    elif policy is not None:
-        _check_same_policy(episode, policy)
-        states = policy.states(episode.images)
-    else:
-        raise UserError(
-            f"rollout {episode.id} of policy {episode.policy!r} has no states; record it with"
-            " `vmdnn evaluate --states`, or name the checkpoint that played it with --policy"
-        )
-    missing = SUBNETS.keys() - states.keys()
-    if missing:
-        raise UserError(f"rollout {episode.id} has no states of {', '.join(sorted(missing))}")
-    return Activity(episode, states)
 
 
 def shown_units(activities: Sequence[Activity]) -> dict[str, NDArray[np.int64]]:
@@ -112,9 +69,7 @@ def difference_by_phase(one: Activity, other: Activity) -> dict[str, list[float]
     Raises:
         UserError: the phases of the episodes differ.
     """
-    starts = one.phase_starts
-    if not np.array_equal(starts, other.phase_starts):
-        raise UserError("the two rollouts have different phases; choose two of the same task")
+    starts = common_phase_starts([one, other])
     return {
         name: [
             float(np.sqrt(np.square(part).mean()))
@@ -144,9 +99,11 @@ def table(activities: Sequence[Activity]) -> Table:
         result.add_column(heading, justify="left" if heading == "subnet" else "right", no_wrap=True)
     changes = [change_per_step(activity) for activity in activities]
     apart = difference_by_phase(*activities) if phases else {name: [] for name in SUBNETS}
-    for name, symbol in SUBNETS.items():
+    for name in SUBNETS:
         change = np.mean([each[name] for each in changes])
-        result.add_row(symbol, f"{change:.3f}", *(f"{value:.2f}" for value in apart[name]))
+        result.add_row(
+            SYMBOLS[name].strip("$"), f"{change:.3f}", *(f"{value:.2f}" for value in apart[name])
+        )
     return result
 
 
@@ -165,13 +122,16 @@ def draw(activities: Sequence[Activity]) -> Figure:
             width_ratios=[*(1.0 for _ in activities), 0.3],
         )
         columns, margin = axes.T[:-1], axes.T[-1]
-        for column, activity, title in zip(columns, activities, _titles(activities), strict=True):
+        titles = distinctions([activity.episode for activity in activities])
+        for column, activity, title in zip(columns, activities, titles, strict=True):
             _draw_column(column, activity, shown)
-            column[0].set_title(title)
+            column[0].set_title(wrapped(title, TITLE_WIDTH))
         for first, name in zip(columns[0], [*SUBNETS, *OUTPUTS], strict=True):
             first.set_ylabel(_row_label(name, activities[0], shown))
         figure.align_ylabels(columns[0])
         _add_legends(figure, columns[-1], margin)
+        phases = wrapped(numbered_phases(activities[0]), CAPTION_WIDTH * len(activities))
+        figure.supxlabel(f"subtasks: {phases}", fontsize=7.5)
         return figure
 
 
@@ -236,6 +196,7 @@ def _mark_phases(column: Sequence[Axes], starts: NDArray[np.int64]) -> None:
             xycoords=("data", "axes fraction"),
             textcoords="offset points",
             ha="center",
+            fontsize=7,  # the shortest subtask of Experiment II is a twentieth of the episode
         )
 
 
@@ -243,52 +204,9 @@ def _row_label(name: str, activity: Activity, shown: Mapping[str, NDArray[np.int
     if name not in SUBNETS:
         return name
     units = activity.states[name].shape[1]
-    symbol = SUBNETS[name]
-    subscripted = f"${symbol[0]}_{symbol[2]}$" if "_" in symbol else symbol
     if units == len(shown[name]):
-        return f"{subscripted}\n{units} units"
-    return f"{subscripted}\n{len(shown[name])} of {units} units"
-
-
-def _titles(activities: Sequence[Activity]) -> list[str]:
-    """Return a title for each episode: the variables that differ; all for a single episode."""
-    situations = [activity.episode.situation for activity in activities]
-    first = situations[0]
-    shown = [
-        name for name in first if len({situation.get(name) for situation in situations}) > 1
-    ] or list(first)
-    return [
-        ", ".join(_value_text(name, situation[name]) for name in shown) for situation in situations
-    ]
-
-
-def _value_text(name: str, value: Value) -> str:
-    words, unit = words_and_unit(name)
-    if isinstance(value, str):
-        return f"{words} {value}"
-    return f"{words} {value:g}°" if unit == "degrees" else f"{words} {value:g} {unit}".rstrip()
-
-
-def _check_same_policy(episode: Episode, policy: StatefulPolicy) -> None:
-    if episode.outputs is None:
-        raise UserError(f"rollout {episode.id} was not played by a network, so it has no states")
-    policy.begin(episode.situation, episode.seed)
-    again = np.stack([_outputs(policy, image) for image in episode.images])
-    difference = (
-        np.abs(again - episode.outputs).max() if again.shape == episode.outputs.shape else np.inf
-    )
-    if difference > _SAME_OUTPUTS:
-        raise UserError(
-            f"rollout {episode.id} was played by {episode.policy!r} version"
-            f" {episode.policy_version}, not by this policy, whose outputs differ"
-        )
-
-
-def _outputs(policy: StatefulPolicy, image: NDArray[np.uint8]) -> Floats:
-    policy.step(image)
-    if policy.outputs is None:
-        raise UserError(f"policy {policy.name!r} has no outputs to compare")
-    return policy.outputs.copy()
+        return f"{SYMBOLS[name]}\n{units} units"
+    return f"{SYMBOLS[name]}\n{len(shown[name])} of {units} units"
 
 
 def _numbers_of(activity: Activity, shown: Mapping[str, NDArray[np.int64]]) -> dict[str, Any]:
@@ -299,6 +217,7 @@ def _numbers_of(activity: Activity, shown: Mapping[str, NDArray[np.int64]]) -> d
         "policy_version": episode.policy_version,
         "situation": dict(episode.situation),
         "reason": episode.outcome.reason,
+        "phases": activity.phase_names,
         "phase_starts": activity.phase_starts[:-1].tolist(),
         "change_per_step": change_per_step(activity),
         "activity": {

@@ -15,7 +15,8 @@ from proto.episode import Episode
 from proto.errors import UserError
 from proto.recordings.episodes import read_episode, write_episode
 from services.cli import main
-from services.figures.activity import UNITS_SHOWN, Activity, activity_of, difference_by_phase
+from services.figures.activity import UNITS_SHOWN, difference_by_phase, draw
+from services.figures.rollouts import Activity, activity_of
 
 UNITS = {"mstnn_fast": 1188, "mstnn_slow": 336, "pfc": 20, "mtrnn_slow": 30, "mtrnn_fast": 50}
 
@@ -50,6 +51,7 @@ def test_one_command_draws_two_rollouts_and_prints_their_difference(
     first = numbers["rollouts"][0]
     assert first["situation"]["object_yaw_deg"] == 44
     assert [episode.phases[start] for start in first["phase_starts"]] == list(range(8))
+    assert first["phases"] == list(episode.phase_names)
     assert np.shape(first["activity"]["pfc"]) == (episode.steps, 20)
     assert {len(apart) for apart in numbers["difference_by_phase"].values()} == {8}
 
@@ -58,8 +60,8 @@ def test_recorded_states_equal_those_computed_from_the_pictures(
     rollouts: list[Path], checkpoint: Path
 ) -> None:
     episode = read_episode(rollouts[0])
-    recorded = activity_of(episode, None).states
-    computed = activity_of(episode, NetworkPolicy.from_file(checkpoint)).states
+    recorded = activity_of(episode, None, UNITS).states
+    computed = activity_of(episode, NetworkPolicy.from_file(checkpoint), UNITS).states
     assert {name: activity.shape for name, activity in recorded.items()} == {
         name: (episode.steps, units) for name, units in UNITS.items()
     }
@@ -82,7 +84,9 @@ def test_the_policy_of_another_rollout_is_refused(
     foreign = replace(episode, outputs=episode.outputs[::-1].copy())
     write_episode(tmp_path / "foreign.mcap", foreign)
     with pytest.raises(UserError, match="not by this policy"):
-        activity_of(read_episode(tmp_path / "foreign.mcap"), NetworkPolicy.from_file(checkpoint))
+        activity_of(
+            read_episode(tmp_path / "foreign.mcap"), NetworkPolicy.from_file(checkpoint), UNITS
+        )
 
 
 def test_a_policy_without_states_and_a_file_name_other_than_png_are_refused(
@@ -105,3 +109,24 @@ def test_the_difference_of_rollouts_is_computed_for_each_phase(
     moved["pfc"][2:4] = 0.5
     apart = difference_by_phase(Activity(episode, still), Activity(episode, moved))
     assert apart == {"mstnn_fast": [0, 0, 0], "pfc": [0, 0.5, 0], "mtrnn_fast": [0, 0, 0]}
+
+
+def test_columns_say_what_differs_and_subtasks_have_names(
+    make_episode: Callable[..., Episode],
+) -> None:
+    """Discrete values, such as those of Experiment II, have their units too."""
+    names = ("observe gesture", "wait", "lift")
+    situation = {"indicated_x_m": "-0.15", "indicated_kind": "laying", "indicated_y_m": 0.25}
+    phases = np.array([0, 0, 1, 1, 2, 2], np.uint8)
+    episodes = [
+        make_episode(6, phases=phases, phase_names=names, situation={**situation, **changed})
+        for changed in ({}, {"indicated_x_m": "0.07", "indicated_y_m": 0.26})
+    ]
+    states = {name: np.zeros((6, 4), np.float32) for name in ("mstnn_fast", "pfc", "mtrnn_fast")}
+    figure = draw([Activity(episode, states) for episode in episodes])
+    titles = [axes.get_title() for axes in figure.axes[:2]]
+    assert titles == [
+        "indicated X -0.15 m, indicated Y 0.25 m",
+        "indicated X 0.07 m, indicated Y 0.26 m",
+    ]
+    assert figure.get_supxlabel() == "subtasks: (1) observe gesture, (2) wait, (3) lift"
