@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
+from actors.policies.blinded import BlindedPolicy
 from actors.policies.contract import Policy
 from actors.policies.planned import PlannedPolicy, make_tutor
 from actors.tasks.contract import Task
@@ -23,7 +24,8 @@ def make_policy(name: str, task: Task) -> Policy:
 
     Args:
         name: `tutor`, a baseline of the task, the path of a checkpoint, `pretrained:NAME`, or a
-            user's class as `package.module:Class`, which is called without arguments.
+            user's class as `package.module:Class`, which is called without arguments. Before it may
+            stand the name of one of `task.blinded`, as in `blank-screen:pretrained:NAME`.
         task: the task that is played.
 
     Raises:
@@ -33,15 +35,19 @@ def make_policy(name: str, task: Task) -> Policy:
         return make_tutor(task)
     if name in task.baselines:
         return PlannedPolicy(name, task, task.baselines[name])
+    first, _, rest = name.partition(":")
+    if rest and first in task.blinded:
+        return BlindedPolicy(first, make_policy(rest, task), task.blinded[first])
     path = checkpoint_path(name)
     if path.is_file():
         return _load_network(path, task)
-    if ":" in name:
+    if rest and all(part.isidentifier() for part in first.split(".")):
         return _make_own(name)
+    blinded = [f"{each}:POLICY" for each in task.blinded]
+    names = ", ".join(["tutor", *task.baselines, *blinded, *pretrained_names()])
     raise UserError(
-        f"policy {name!r}: no such policy or checkpoint file. There are: "
-        f"{', '.join(['tutor', *task.baselines, *pretrained_names()])}, the path of a .safetensors"
-        " checkpoint, or a policy of your own as package.module:Class."
+        f"policy {name!r}: no such policy or checkpoint file. There are: {names}, the path of a"
+        " .safetensors checkpoint, or a policy of your own as package.module:Class."
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from actors.motion import execution_noise
-from actors.tasks.contract import Array, Belief, Task
+from actors.tasks.contract import Array, Belief, Recollection, Task
 from proto.config import TutorConfig
 from proto.episode import Floats, Image
 from proto.variables import Situation
@@ -17,7 +17,11 @@ class PlannedPolicy:
     outputs: Floats | None = None
 
     def __init__(
-        self, name: str, task: Task, belief: Belief, noise: TutorConfig | None = None
+        self,
+        name: str,
+        task: Task,
+        belief: Belief | Recollection,
+        noise: TutorConfig | None = None,
     ) -> None:
         """Make a policy.
 
@@ -36,14 +40,25 @@ class PlannedPolicy:
         self._step = 0
 
     def begin(self, situation: Situation, seed: int) -> None:
-        """Plan the episode; `seed` is the seed of the execution noise."""
-        self._plan = self._task.plan(self._belief(situation))
+        """Plan the episode.
+
+        Args:
+            situation: the real situation.
+            seed: seed of the execution noise. The episode before is the one with the next smaller
+                seed, whose situation the task draws; for seed 0 it is the one with seed 1.
+        """
+        self._plan = self._task.plan(self._assumed(situation, seed))
         self._actions = self._plan
         if self._noise is not None:
             self._actions = self._plan + execution_noise(
                 len(self._plan), seed, self._noise.noise_deg, self._noise.noise_correlation_steps
             )
         self._step = 0
+
+    def _assumed(self, situation: Situation, seed: int) -> Situation:
+        if isinstance(self._belief, Recollection):
+            return self._belief.assume(situation, self._task.sample(abs(seed - 1)))
+        return self._belief(situation)
 
     def step(self, image: Image) -> Array:  # noqa: ARG002 - it follows the plan
         """Return the next action (11,) of the plan."""

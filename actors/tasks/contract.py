@@ -31,8 +31,23 @@ from proto.variables import (
 )
 
 Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
 Belief = Callable[[Situation], Situation]
 """Maps the real situation to the situation that a baseline assumes."""
+Blinding = Callable[[int, Image], Image]
+"""Maps a control step, from 0, and the picture (48, 64) uint8 to the picture that a policy sees."""
+
+
+@dataclass(frozen=True)
+class Recollection:
+    """A belief that depends on the episode before, as if a baseline remembered it.
+
+    Attributes:
+        assume: maps the real situation and the situation of the episode before to the situation
+            that the baseline assumes.
+    """
+
+    assume: Callable[[Situation, Situation], Situation]
 
 
 class Judge(Protocol):
@@ -104,6 +119,8 @@ class Task(ABC):
             differ in them may be mixed (see `learner.training.interpolation`).
         baselines: by name, the situation that a baseline assumes. A baseline executes the tutor's
             plan for this situation.
+        blinded: by name, how the pictures of a policy are changed so that something is hidden from
+            it. `NAME:POLICY` is the policy that sees the changed pictures.
         figure_words: labels and errors for figures.
         options: names of the task's options in the section `task` of a configuration, besides name
             and attention.
@@ -117,7 +134,8 @@ class Task(ABC):
     start: Array
     questions: tuple[Question, ...] = ()
     distractors: frozenset[str] = frozenset()
-    baselines: ClassVar[Mapping[str, Belief]] = {}
+    baselines: ClassVar[Mapping[str, Belief | Recollection]] = {}
+    blinded: ClassVar[Mapping[str, Blinding]] = {}
     figure_words: ClassVar[FigureWords] = FigureWords({})
     options: ClassVar[frozenset[str]] = frozenset()
 

@@ -17,7 +17,7 @@ TASKS: Final[Mapping[str, str]] = {
 _METHODS: Final = ("tutored", "sample", "check", "corners", "scene", "plan", "judge")
 _ATTRIBUTES: Final = (
     *("variables", "subtasks", "start", "questions", "baselines", "figure_words"),
-    *("phases", "phase_names", "attention"),
+    *("blinded", "phases", "phase_names", "attention"),
 )
 
 

@@ -35,7 +35,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--policy",
         required=True,
         help="tutor, a baseline of the task (`vmdnn inspect task` lists them), pretrained:NAME, a"
-        " checkpoint's file, or a class of your own as package.module:Class",
+        " checkpoint's file, or a class of your own as package.module:Class; a task may name"
+        " blinded policies, such as blank-screen:POLICY",
     )
     parser.add_argument("--trials", type=positive, default=52, help="number of situations")
     parser.add_argument(

@@ -19,6 +19,7 @@ def task_description(task: Task) -> dict[str, Any]:
         "phases": dict(task.subtasks),
         "tutored_cases": len(task.tutored()),
         "baselines": ["tutor", *task.baselines],
+        "blinded": [f"{name}:POLICY" for name in task.blinded],
         "questions": [question.variable for question in task.questions],
     }
 
@@ -34,6 +35,8 @@ def task_table(task: Task) -> Table:
     table.add_row("phases (steps)", ", ".join(phases))
     table.add_row("tutored cases", str(len(task.tutored())))
     table.add_row("baselines", ", ".join(["tutor", *task.baselines]))
+    if task.blinded:
+        table.add_row("blinded policies", ", ".join(f"{name}:POLICY" for name in task.blinded))
     asked = ", ".join(question.variable for question in task.questions)
     table.add_row("pre-training asks for", asked or "nothing")
     return table

@@ -1,11 +1,15 @@
-"""Baselines of Experiment II: what each takes a situation for. None of them looks."""
+"""Baselines of Experiment II: the situation that each assumes, and pictures that hide the gesture.
+
+No baseline uses the picture.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, cast
 
-from actors.tasks.contract import Belief
+from actors.simulator import Image
+from actors.tasks.contract import Belief, Blinding, Recollection
 from actors.tasks.experiment2.setting import (
     INDICATED_X,
     KINDS,
@@ -15,21 +19,28 @@ from actors.tasks.experiment2.setting import (
 )
 from actors.tasks.experiment2.world import Y_RANGE_M, YAW_RANGE_DEG
 from proto.variables import Situation, Value
+from sim_assets.gestures.clip import FRAMES
+
+BLANK_GREY: Final = 128
+"""Grey level of the blank screen, in the middle of all levels."""
+BLANK_COLUMNS: Final = slice(4, 59)
+"""Columns of the picture that the screen fills at the start, and five more on either side."""
 
 
 def _always(place: Place) -> Belief:
-    """The belief that the person always points at one place."""
-
-    def belief(situation: Situation) -> Situation:
-        return (
-            situation if situation[INDICATED_X] == place else _pointed_elsewhere(situation, place)
-        )
-
-    return belief
+    """Return the belief that the person always points at `place`."""
+    return lambda situation: _pointed_at(situation, place)
 
 
-def _pointed_elsewhere(situation: Situation, place: Place) -> Situation:
-    """The same objects, of which the person points at the one at `place`."""
+def _as_before(situation: Situation, before: Situation) -> Situation:
+    """Return the situation if the person points where the one of the episode before pointed."""
+    return _pointed_at(situation, cast("Place", before[INDICATED_X]))
+
+
+def _pointed_at(situation: Situation, place: Place) -> Situation:
+    """Return the situation with the same objects in which the person points at `place`."""
+    if situation[INDICATED_X] == place:
+        return situation
     swapped = dict(situation)
     swapped[INDICATED_X] = place
     for value in ("kind", "y_m", "yaw_deg"):
@@ -39,7 +50,7 @@ def _pointed_elsewhere(situation: Situation, place: Place) -> Situation:
 
 
 def _other_kinds(situation: Situation) -> Situation:
-    """The same places, at which every object is of the other kind."""
+    """Return the situation with objects of the other kind at the same places."""
     kinds = {
         variable_name(role, "kind"): next(
             kind for kind in KINDS if kind != situation[variable_name(role, "kind")]
@@ -50,7 +61,7 @@ def _other_kinds(situation: Situation) -> Situation:
 
 
 def _in_the_middle(situation: Situation) -> Situation:
-    """The same kinds, in the middle of the ranges."""
+    """Return the situation with both objects in the middle of the ranges."""
     y_m, yaw_deg = sum(Y_RANGE_M) / 2, sum(YAW_RANGE_DEG) / 2
     middle: dict[str, Value] = {}
     for role in ROLES:
@@ -59,12 +70,25 @@ def _in_the_middle(situation: Situation) -> Situation:
     return {**situation, **middle}
 
 
-BASELINES: Final[Mapping[str, Belief]] = {
-    # the gesture is not looked at: right in half of the situations
+def _blank_screen(step: int, image: Image) -> Image:
+    """Return the picture with a grey screen while the gesture is shown."""
+    if step >= FRAMES:
+        return image
+    blank = image.copy()
+    blank[:, BLANK_COLUMNS] = BLANK_GREY
+    return blank
+
+
+BASELINES: Final[Mapping[str, Belief | Recollection]] = {
+    # the gesture is not used: the right object in half of the situations
     "always-negative-x": _always("-0.15"),
     "always-positive-x": _always("0.07"),
-    # the right object, grasped as the other kind is
+    # the gesture of the episode before: the right object in half of the situations
+    "last-gesture": Recollection(_as_before),
+    # the right object, grasped like one of the other kind
     "kind-blind": _other_kinds,
     # the right object and kind, always at the same Y and yaw
     "pose-blind": _in_the_middle,
 }
+
+BLINDED: Final[Mapping[str, Blinding]] = {"blank-screen": _blank_screen}

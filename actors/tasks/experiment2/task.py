@@ -11,7 +11,7 @@ import numpy as np
 from actors.simulator import Scene
 from actors.tasks.contract import Array, Task
 from actors.tasks.experiment2 import world
-from actors.tasks.experiment2.baselines import BASELINES
+from actors.tasks.experiment2.baselines import BASELINES, BLINDED
 from actors.tasks.experiment2.clips import OPTIONS, Clips, clips_of, whole_number
 from actors.tasks.experiment2.figure_words import FIGURE_WORDS
 from actors.tasks.experiment2.judge import Experiment2Judge
@@ -59,6 +59,7 @@ class Experiment2(Task):
     start = world.START
     distractors = frozenset({"other_y_m", "other_yaw_deg", SUBJECT, TAKE})
     baselines = BASELINES
+    blinded = BLINDED
     figure_words = FIGURE_WORDS
     options = OPTIONS
 

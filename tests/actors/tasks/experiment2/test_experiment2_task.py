@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 
 import cv2
@@ -18,6 +19,7 @@ from proto.errors import UserError
 from sim_assets.gestures.drawing import draw_clip
 from sim_assets.gestures.subject import Subject
 
+DARK = np.zeros((48, 64), dtype=np.uint8)
 FIXED = {"indicated_y_m": 0.255, "other_y_m": 0.255, "indicated_yaw_deg": 0.0, "other_yaw_deg": 0.0}
 
 
@@ -207,8 +209,47 @@ def test_baselines_ignore_the_variables_they_are_blind_to():
     assert middle["indicated_y_m"] == pytest.approx(0.255)
     assert middle["indicated_yaw_deg"] == 0.0
     assert middle["indicated_kind"] == situation["indicated_kind"]
-    for belief in TASK.baselines.values():
+    for belief in (TASK.baselines[name] for name in TASK.baselines if name != "last-gesture"):
         TASK.check(belief(situation))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 1000])
+def test_last_gesture_takes_the_side_of_the_situation_with_the_seed_before(seed):
+    """Only the side is remembered: objects, kinds and poses are the real ones."""
+    before = TASK.sample(abs(seed - 1))["indicated_x_m"]
+    policy = make_policy("last-gesture", TASK)
+    for situation in (TASK.sample(seed), {**TASK.sample(seed), "indicated_x_m": "0.07"}):
+        policy.begin(situation, seed)
+        actions = np.stack([policy.step(DARK) for _ in TASK.phases])
+        side = "negative" if before == "-0.15" else "positive"
+        assumed = TASK.baselines[f"always-{side}-x"](situation)
+        np.testing.assert_array_equal(actions, TASK.plan(assumed))
+
+
+def test_last_gesture_is_right_in_half_of_the_situations():
+    sides = [TASK.sample(seed)["indicated_x_m"] for seed in range(400)]
+    right = sum(before == now for before, now in itertools.pairwise(sides))
+    assert 160 < right < 240
+
+
+def test_a_blank_screen_hides_the_clip_and_nothing_else():
+    """The screen's pixels differ between clips; outside them all pictures are the same."""
+    simulator = make_simulator(SimulatorConfig())
+    tutor, blind = make_policy("tutor", TASK), TASK.blinded["blank-screen"]
+    played = [
+        play(simulator, TASK, tutor, TASK.tutored()[number], seed=1, kind=Kind.TRIAL).images
+        for number in (0, 1)
+    ]
+    simulator.close()
+    one, other = (
+        np.stack([blind(step, image) for step, image in enumerate(images)]) for images in played
+    )
+    assert (played[0][:40] != played[1][:40]).any()
+    np.testing.assert_array_equal(one[:40], other[:40])
+    np.testing.assert_array_equal(one[40:], played[0][40:])
+    margin = (one[:40] == played[0][:40]).all(axis=(0, 1))
+    assert margin[:4].all()
+    assert margin[-5:].all()
 
 
 @pytest.fixture(scope="module")
