@@ -13,7 +13,7 @@ from typing import Final, Protocol, cast
 from proto.errors import UserError
 
 
-class Command(Protocol):
+class Subcommand(Protocol):
     """A module that is a subcommand."""
 
     def configure(self, parser: argparse.ArgumentParser) -> None:
@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             formatter_class=argparse.ArgumentDefaultsHelpFormatter,
         )
         if name == chosen:
-            command = cast("Command", importlib.import_module(module))
+            command = cast("Subcommand", importlib.import_module(module))
             command.configure(subparser)
             subparser.set_defaults(run=command.run)
     arguments = parser.parse_args(words)

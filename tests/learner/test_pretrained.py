@@ -20,3 +20,11 @@ def test_the_pretrained_networks_can_act() -> None:
 def test_a_wrong_name_is_refused_with_a_list_of_names() -> None:
     with pytest.raises(UserError, match=r"no policy pretrained:dance.*pretrained:experiment1"):
         load_checkpoint(f"{PREFIX}dance")
+
+
+@pytest.mark.parametrize("name", pretrained_names())
+def test_each_says_what_it_was_trained_for(name: str) -> None:
+    metadata = load_checkpoint(name).metadata
+    assert metadata.format == 2
+    assert metadata.task == name.removeprefix("pretrained:").partition("-")[0]
+    assert metadata.backend == "sapien"
