@@ -89,6 +89,22 @@ class GraspError:
 
 
 @dataclass(frozen=True)
+class MemoryProbe:
+    """How it can be tested whether a network remembers a variable.
+
+    Attributes:
+        phase: name of the last phase in which what is seen and done is the same for all choices.
+        variable: the discrete variable that must be remembered until then.
+        output: name of the action value (see `proto.body`) that tells the choice when the next
+            phase is over.
+    """
+
+    phase: str
+    variable: str
+    output: str
+
+
+@dataclass(frozen=True)
 class FigureWords:
     """Labels and errors of a task that figures show.
 
@@ -97,11 +113,14 @@ class FigureWords:
         errors: the errors of the grasp.
         in_place: returns whether the object had not moved before the hand closed. Errors of the
             grasp are meaningful only then.
+        memory: how it can be tested whether a network remembers a variable; None if nothing must
+            be remembered.
     """
 
     reasons: Mapping[str, str]
     errors: tuple[GraspError, ...] = ()
     in_place: Callable[[Outcome], bool] = lambda _: True
+    memory: MemoryProbe | None = None
 
 
 class Task(ABC):
