@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from typing import ClassVar, Protocol
@@ -115,12 +115,15 @@ class FigureWords:
             grasp are meaningful only then.
         memory: how it can be tested whether a network remembers a variable; None if nothing must
             be remembered.
+        published: published number of lenient successes and of trials by time constant of the PFC;
+            empty if nothing was published.
     """
 
     reasons: Mapping[str, str]
     errors: tuple[GraspError, ...] = ()
     in_place: Callable[[Outcome], bool] = lambda _: True
     memory: MemoryProbe | None = None
+    published: Mapping[float, tuple[int, int]] = field(default_factory=dict)
 
 
 class Task(ABC):
