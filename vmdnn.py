@@ -144,7 +144,8 @@ def make_policy(name: str | Path, task: Task) -> Policy:
 
     Args:
         name: `tutor`, a baseline of the task, `pretrained:NAME`, the path of a checkpoint, or your
-            own class as `package.module:Class`.
+            own class as `package.module:Class`. Before it may stand the name of one of
+            `task.blinded`, as in `blank-screen:pretrained:NAME`.
         task: the task.
     """
     from actors.policies.by_name import make_policy as make  # noqa: PLC0415

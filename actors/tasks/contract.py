@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import product
 from typing import ClassVar, Protocol
@@ -89,6 +89,22 @@ class GraspError:
 
 
 @dataclass(frozen=True)
+class MemoryProbe:
+    """How it can be tested whether a network remembers a variable.
+
+    Attributes:
+        phase: name of the last phase in which what is seen and done is the same for all choices.
+        variable: the discrete variable that must be remembered until then.
+        output: name of the action value (see `proto.body`) that tells the choice when the next
+            phase is over.
+    """
+
+    phase: str
+    variable: str
+    output: str
+
+
+@dataclass(frozen=True)
 class FigureWords:
     """Labels and errors of a task that figures show.
 
@@ -97,11 +113,17 @@ class FigureWords:
         errors: the errors of the grasp.
         in_place: returns whether the object had not moved before the hand closed. Errors of the
             grasp are meaningful only then.
+        memory: how it can be tested whether a network remembers a variable; None if nothing must
+            be remembered.
+        published: published number of lenient successes and of trials by time constant of the PFC;
+            empty if nothing was published.
     """
 
     reasons: Mapping[str, str]
     errors: tuple[GraspError, ...] = ()
     in_place: Callable[[Outcome], bool] = lambda _: True
+    memory: MemoryProbe | None = None
+    published: Mapping[float, tuple[int, int]] = field(default_factory=dict)
 
 
 class Task(ABC):

@@ -15,6 +15,7 @@ from services.commands.figures import (
     corrections,
     failures,
     gestures,
+    memory,
     time_constants,
     trajectories,
 )
@@ -37,6 +38,7 @@ class FigureCommand(Protocol):
 FIGURES: Final[Mapping[str, FigureCommand]] = {
     "activity": activity,
     "trajectories": trajectories,
+    "memory": memory,
     "time-constants": time_constants,
     "failures": failures,
     "corrections": corrections,

@@ -11,18 +11,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from actors.tasks.contract import FigureWords
 from services.figures.style import BLACK, BLUE, GREY, figure_style, percent
 from services.terminal.rates import difference_text, percent_text, rate_text
 from services.trials.success import READINGS, Rate, Tally, difference95, pooled
 from services.trials.sweeps import RunOutcomes
 
-PAPER: Final[Mapping[float, Rate]] = {30.0: Rate(32, 52), 150.0: Rate(44, 52)}
-"""Published rates by time constant; the paper's criterion of success is our `lenient`."""
 PAPER_TAU: Final = 150.0
 """Time constant of the PFC in the paper's network."""
 
 Tallies = Mapping[float, Mapping[int, Tally]]
 """Counted trials by time constant and training seed."""
+Published = Mapping[float, Rate]
+"""Published rates by time constant; the paper's criterion of success is our `lenient`."""
 
 
 def tallies_of(tested: Sequence[RunOutcomes]) -> Tallies:
@@ -33,7 +34,12 @@ def tallies_of(tested: Sequence[RunOutcomes]) -> Tallies:
     return by_tau
 
 
-def numbers(tallies: Tallies) -> dict[str, Any]:
+def published_rates(words: FigureWords) -> Published:
+    """Return the published rates of a task."""
+    return {tau: Rate(*counts) for tau, counts in words.published.items()}
+
+
+def numbers(tallies: Tallies, published: Published) -> dict[str, Any]:
     """Return the numbers of the figure, for `json.dumps`."""
     return {
         "time_constants": [
@@ -53,7 +59,7 @@ def numbers(tallies: Tallies) -> dict[str, Any]:
             for tau, by_seed in tallies.items()
         ],
         "paper": {
-            f"{tau:g}": rate.as_json() | {"trials": rate.trials} for tau, rate in PAPER.items()
+            f"{tau:g}": rate.as_json() | {"trials": rate.trials} for tau, rate in published.items()
         },
     }
 
@@ -84,16 +90,16 @@ def table(tallies: Tallies) -> Table:
     return result
 
 
-def draw(tallies: Tallies) -> Figure:
-    """Draw one panel for each reading of success, with the paper's rates beside ours."""
+def draw(tallies: Tallies, published: Published) -> Figure:
+    """Draw one panel for each reading of success, with the published rates beside ours."""
     with figure_style():
         figure = Figure(figsize=(8.4, 3.2), layout="constrained")
         panels = figure.subplots(1, len(READINGS), sharey=True)
         for axes, reading in zip(panels, READINGS, strict=True):
-            _draw_reading(axes, tallies, reading)
+            _draw_reading(axes, tallies, published, reading)
             axes.set_title(reading)
             axes.set_xlabel("time constant of the PFC (steps)")
-            axes.set_xticks(sorted({*tallies, *PAPER}))
+            axes.set_xticks(sorted({*tallies, *published}))
             axes.set_ylim(0, 102)
         panels[0].set_ylabel("success (%)")
         handles, labels = panels[0].get_legend_handles_labels()
@@ -101,9 +107,10 @@ def draw(tallies: Tallies) -> Figure:
         return figure
 
 
-def _draw_reading(axes: Axes, tallies: Tallies, reading: str) -> None:
-    published = "paper (lifted at the end)"
-    _draw_rates(axes, PAPER, -4.0, color=GREY, marker="D", linestyle="none", label=published)
+def _draw_reading(axes: Axes, tallies: Tallies, published: Published, reading: str) -> None:
+    if published:
+        words = "paper (lifted at the end)"
+        _draw_rates(axes, published, -4.0, color=GREY, marker="D", linestyle="none", label=words)
     rates = {tau: pooled(by_seed.values(), reading) for tau, by_seed in tallies.items()}
     _draw_rates(axes, rates, 0.0, color=BLUE, marker="o", linewidth=1.0, label="ours, all seeds")
     places = [(tau, tally) for tau, by_seed in tallies.items() for tally in by_seed.values()]

@@ -44,7 +44,7 @@ COLOURS: Final = (RED, BLUE, GREEN, SKY, ORANGE, PINK, BLACK, YELLOW)
 CAPTION_WIDTH: Final = 120
 LEGEND_WIDTH: Final = 60
 _CLOSE: Final = 0.03
-"""Numbers of a subtask are drawn once if they are closer than this share of the plot's extent."""
+"""A number is left out if it is closer to another one than this share of the plot's extent."""
 
 
 @dataclass(frozen=True)
@@ -249,14 +249,14 @@ def _draw_plane(axes: Axes, trajectories: Trajectories, points: Sequence[Array])
     starts = trajectories.phase_starts[:-1]
     extent = np.ptp(np.concatenate(points), axis=0)
     extent[extent == 0] = 1.0
-    numbered: dict[int, list[Array]] = defaultdict(list)
+    numbered: list[Array] = []
     words = distinctions([activity.episode for activity in trajectories.activities])
     for each, colour, label in zip(points, cycle(COLOURS), words, strict=False):
         axes.plot(*each.T, color=colour, linewidth=1.0, label=wrapped(label, LEGEND_WIDTH))
         axes.scatter(each[starts, 0], each[starts, 1], s=8, color=colour, zorder=3)
         for phase, point in enumerate(each[starts], 1):
-            if not _is_close(point, numbered[phase], extent):
-                numbered[phase].append(point)
+            if not _is_close(point, numbered, extent):
+                numbered.append(point)
                 axes.annotate(
                     str(phase),
                     (float(point[0]), float(point[1])),

@@ -29,4 +29,5 @@ FIGURE_WORDS: Final = FigureWords(
     },
     errors=grasp_errors(judge.TOLERANCE, yaw="object_yaw_deg", y="object_y_m"),
     in_place=_in_place,
+    published={30.0: (32, 52), 150.0: (44, 52)},
 )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Final
 
-from actors.tasks.contract import FigureWords
+from actors.tasks.contract import FigureWords, MemoryProbe
 from actors.tasks.experiment2 import judge
+from actors.tasks.experiment2.setting import INDICATED_X
 from actors.tasks.grasp_errors import grasp_errors
 from proto.episode import NO_FAILURE, Outcome
 
@@ -32,4 +33,5 @@ FIGURE_WORDS: Final = FigureWords(
     },
     errors=grasp_errors(judge.TOLERANCE, yaw="indicated_yaw_deg", y="indicated_y_m"),
     in_place=_in_place,
+    memory=MemoryProbe("observe task space", INDICATED_X, "neck_yaw"),
 )

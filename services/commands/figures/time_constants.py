@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Final
 
+from actors.tasks.registry import make_task
 from services.arguments.common import add_config, add_playing, playing_config
 from services.arguments.sweeping import add_sweep, run_sweep
 from services.arguments.training import add_training_data, training_stores
@@ -46,8 +47,11 @@ def draw(arguments: argparse.Namespace) -> FigureResult:
     ]
     tested = run_sweep(arguments, variants, work_folder(arguments), lambda _: stores)
     tallies = time_constants.tallies_of(tested)
+    published = time_constants.published_rates(make_task(config.task).figure_words)
     return FigureResult(
-        time_constants.draw(tallies), time_constants.numbers(tallies), time_constants.table(tallies)
+        time_constants.draw(tallies, published),
+        time_constants.numbers(tallies, published),
+        time_constants.table(tallies),
     )
 
 

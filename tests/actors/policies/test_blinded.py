@@ -75,8 +75,8 @@ def test_a_policy_without_states_is_named() -> None:
 def test_a_task_names_its_blinded_policies() -> None:
     task = make_task(TaskConfig(name="experiment2"))
     assert make_policy("blank-screen:tutor", task).name == "blank-screen-tutor"
-    network = make_policy("blank-screen:pretrained:experiment1", task)
-    assert (network.name, network.looks) == ("blank-screen-experiment1", True)
+    with pytest.raises(UserError, match="trained for the task 'experiment1'"):
+        make_policy("blank-screen:pretrained:experiment1", task)
     with pytest.raises(UserError, match="blank-screen:POLICY"):
         make_policy("blank-screen", task)
     with pytest.raises(UserError, match="no such policy or checkpoint file"):

@@ -67,6 +67,21 @@ def test_one_command_trains_tests_and_draws_and_repeats_nothing(
     assert "tau0.5" in capsys.readouterr().err
 
 
+def test_experiment_2_with_a_delay_is_swept_without_rates_of_another_experiment(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    task = "--set task.name=experiment2 --set task.delay_steps=30"
+    tutored = tmp_path / "tutored"
+    assert main(f"tutor --cases 0,1 --repeats 1 --workers 1 --out {tutored} {task}".split()) == 0
+    capsys.readouterr()
+    assert draw(tutored, tmp_path / "two.png", task) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [each["tau"] for each in told["time_constants"]] == [30, 150]
+    assert told["paper"] == {}
+    saved = load_config(tmp_path / "two" / "tau30_seed1" / "config.yaml")
+    assert saved.task.options == {"delay_steps": 30}
+
+
 def test_a_stopped_training_continues(recordings: Path, tmp_path: Path) -> None:
     values = {"learner": {"pretraining": {"epochs": 1}, "epochs": 2, "warmup_epochs": 1}}
     variant = sweeps.Variant("short", Config.model_validate(values))
