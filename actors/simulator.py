@@ -240,7 +240,11 @@ class Simulator(Protocol):
 
     @abstractmethod
     def reset(self, scene: Scene) -> None:
-        """Replace the previous scene by `scene`; the same scene gives the same episode."""
+        """Replace the previous scene by `scene`; the same scene gives the same episode.
+
+        Raises:
+            UserError: it cannot show what the scene has, such as a screen.
+        """
 
     @abstractmethod
     def step(self, targets: JointTargets) -> StepReport:

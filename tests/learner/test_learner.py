@@ -309,7 +309,9 @@ def test_its_policy_is_corrected_where_it_fails_and_training_continues(setup: Le
     )
     assert (metrics.epoch, metrics.epochs_total, metrics.policy_version) == (6, 10, 2)
     assert (metrics.corrections, metrics.corrections_total, metrics.done) == (0, 3, False)
-    eventually(lambda: [p.epoch for p in setup.policies] == [5, 6], "the policies of the first lap")
+    eventually(
+        lambda: [p.epoch for p in setup.policies] == [5, 6], "the policies of the first round"
+    )
     assert setup.ask() == [], "it knows of no failure"
 
     first, second = setup.fail_in_practice(2**30), setup.fail_in_practice(2**30 + 1)

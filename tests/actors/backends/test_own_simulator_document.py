@@ -45,6 +45,17 @@ def test_its_backend_is_found_in_the_current_folder_and_plays(folder: Path) -> N
     assert f'"backend": "{BACKEND}"' in answer.stdout
 
 
+def test_its_backend_refuses_a_scene_with_a_screen(folder: Path) -> None:
+    command = (
+        f"services.cli evaluate --task experiment2 --policy tutor --trials 2 --backend {BACKEND}"
+    )
+    answer = call(folder, ROOT, command)
+    assert answer.returncode == 2, answer.stderr
+    assert answer.stderr.strip().endswith(
+        "Still shows no screens: choose another simulator.backend or task.name"
+    )
+
+
 def test_the_suite_runs_on_it(folder: Path) -> None:
     (command,) = re.findall(r"^PYTHONPATH=FOLDER .*-m (.*)$", TEXT, re.MULTILINE)
     answer = call(ROOT, folder, f"{command} -p no:cacheprovider")
