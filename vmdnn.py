@@ -98,7 +98,7 @@ def load_config(source: str | Path | None = None, overrides: Sequence[str] = ())
     """Read a configuration.
 
     Args:
-        source: a YAML file, the name of a built-in configuration (`experiment1`, `smoke`, `paper`),
+        source: a YAML file, the name of a built-in configuration (such as `experiment2`),
             or None for all defaults.
         overrides: values to change, such as `learner.epochs=10`.
 
