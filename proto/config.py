@@ -266,6 +266,8 @@ class PretrainingConfig(_Section):
     image_shift: Natural = 3
     image_gain: NotNegative = 0.05
     image_noise: NotNegative = 0.03
+    # Threads of pre-training, while actors wait for the first policy; by default `learner.threads`.
+    threads: Count | None = None
 
 
 class CorrectionsConfig(_Section):

@@ -33,6 +33,7 @@ from learner.checkpoint import (
     save_checkpoint,
 )
 from learner.tensors import prefixed, to_arrays, to_tensors
+from learner.training.memory import keep_freed_memory
 from learner.training.optimization import Optimization
 from learner.training.recipe import Recipe, StageObjective
 from learner.training.schedule import RoundSchedule
@@ -79,13 +80,13 @@ class Trainer:
 
         Args:
             recipe: the network, and how it is trained. The number of threads that its config asks
-                for is set for the whole process.
+                for in each stage is set for the whole process.
             store: sequences to learn from.
             pretraining_store: sequences for pre-training; without it, those of `store`.
             rounds: rounds of corrections. The caller adds corrections to the store before each.
         """
         config = recipe.config
-        torch.set_num_threads(config.learner.threads)
+        keep_freed_memory()
         self.recipe = recipe
         self._store = store
         self._pretraining_store, self._pretraining_task = store, config.task.name
@@ -220,12 +221,18 @@ class Trainer:
         save_checkpoint(path, Checkpoint(metadata, to_arrays(parts)))
 
     def _enter(self, stage: Stage) -> None:
+        torch.set_num_threads(self._threads(stage))
         self.stage = stage
         self.epochs_done = 0
         self.loss = None
         self._intake = self._new_intake()
         self.objective = None
         self._optimization = None
+
+    def _threads(self, stage: Stage) -> int:
+        config = self.recipe.config.learner
+        asked_for = config.pretraining.threads if stage is Stage.PRETRAINING else None
+        return asked_for or config.threads
 
     def _finish_if_done(self) -> None:
         if self.stage is Stage.COUPLED and self.epochs_done >= self.epochs_total:

@@ -380,3 +380,16 @@ def test_diverging_training_is_reported_and_stops(
     with pytest.raises(UserError, match=r"diverged .*: lower learner.rate"):
         trainer.epoch()
     assert trainer.epochs_done == 1
+
+
+def test_pretraining_has_its_own_number_of_threads(
+    store: TutoringStore, small_config: MakeConfig
+) -> None:
+    config = small_config(pretraining=1, threads=1)
+    pretraining = config.learner.pretraining.model_copy(update={"threads": 2})
+    learner = config.learner.model_copy(update={"pretraining": pretraining})
+    trainer = Trainer(VMDNNRecipe(config.model_copy(update={"learner": learner}), QUESTIONS), store)
+    trainer.epoch()
+    assert torch.get_num_threads() == 2
+    trainer.epoch()
+    assert torch.get_num_threads() == 1
