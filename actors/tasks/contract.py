@@ -220,11 +220,16 @@ class Task(ABC):
         They are all combinations of the minimum and maximum of each continuous variable and the
         choices of each discrete variable.
         """
-        ends: list[Sequence[Value]] = [
-            (variable.minimum, variable.maximum)
-            if isinstance(variable, Continuous)
-            else variable.choices
-            for variable in self.variables
-        ]
-        names = [variable.name for variable in self.variables]
-        return [dict(zip(names, values, strict=True)) for values in product(*ends)]
+        return corners_of(self.variables)
+
+
+def corners_of(variables: Sequence[Variable]) -> Sequence[Situation]:
+    """Return all combinations of the ends of continuous variables and the choices of discrete ones."""
+    ends: list[Sequence[Value]] = [
+        (variable.minimum, variable.maximum)
+        if isinstance(variable, Continuous)
+        else variable.choices
+        for variable in variables
+    ]
+    names = [variable.name for variable in variables]
+    return [dict(zip(names, values, strict=True)) for values in product(*ends)]

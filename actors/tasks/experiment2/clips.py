@@ -1,4 +1,4 @@
-"""The task's options, and the clips that are tutored and shown in trials by them."""
+"""The task's options, and the clips that are tutored, practised and shown in trials by them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,23 @@ DRAWN_OPTIONS: Final = ("subjects", "takes", "trials_show")
 """Options that a folder of videos decides."""
 NEW_TAKES: Final = "new-takes"
 NEW_SUBJECTS: Final = "new-subjects"
-NEW_SUBJECT_COUNT: Final = 8
+NEW_SUBJECT_COUNT: Final = 50
 """Number of subjects that only trials show."""
+NEW_TAKE_COUNT: Final = 100
+"""Number of takes of each subject, for either side, that only trials show; as many for practice."""
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Clips: all takes of all subjects, for either side.
+
+    Attributes:
+        subjects: names of the subjects.
+        takes: names of the recordings of each of them, for either side.
+    """
+
+    subjects: tuple[str, ...]
+    takes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -27,27 +42,29 @@ class Clips:
 
     Attributes:
         library: where they come from.
-        tutored_subjects: who points in tutored situations.
-        tutored_takes: the recordings of each of them, for either side.
-        trial_subjects: who points in trials.
-        trial_takes: the recordings of each of them, for either side.
+        tutored: what tutored situations show.
+        practice: what practice and corrections show. A policy may be corrected on these.
+        trials: what trials show; neither tutored nor practised, unless they are videos.
     """
 
     library: GestureLibrary
-    tutored_subjects: tuple[str, ...]
-    tutored_takes: tuple[str, ...]
-    trial_subjects: tuple[str, ...]
-    trial_takes: tuple[str, ...]
+    tutored: Pool
+    practice: Pool
+    trials: Pool
 
     @property
     def subjects(self) -> tuple[str, ...]:
         """All subjects, each once."""
-        return tuple(dict.fromkeys(self.tutored_subjects + self.trial_subjects))
+        return tuple(dict.fromkeys(name for pool in self._pools for name in pool.subjects))
 
     @property
     def takes(self) -> tuple[str, ...]:
         """All takes, each once."""
-        return tuple(dict.fromkeys(self.tutored_takes + self.trial_takes))
+        return tuple(dict.fromkeys(name for pool in self._pools for name in pool.takes))
+
+    @property
+    def _pools(self) -> tuple[Pool, ...]:
+        return (self.tutored, self.trials, self.practice)
 
 
 def clips_of(options: Mapping[str, Any], task: str) -> Clips:
@@ -102,12 +119,16 @@ def _drawn(options: Mapping[str, Any], task: str) -> Clips:
         raise UserError(
             f"task.trials_show = {shown!r}: trials of {task} show {NEW_TAKES} or {NEW_SUBJECTS}"
         )
-    tutored = DrawnGestures(subjects, takes)
+    library = DrawnGestures(subjects, takes)
+    tutored = Pool(library.subjects, library.takes)
     if shown == NEW_TAKES:
-        trial_subjects, trial_takes = tutored.subjects, _names(takes, 2 * takes)
+        trials = Pool(tutored.subjects, _names(takes, NEW_TAKE_COUNT))
+        practised_from = takes + NEW_TAKE_COUNT
     else:
-        trial_subjects, trial_takes = _names(subjects, subjects + NEW_SUBJECT_COUNT), tutored.takes
-    return Clips(tutored, tutored.subjects, tutored.takes, trial_subjects, trial_takes)
+        trials = Pool(_names(subjects, NEW_SUBJECT_COUNT), tutored.takes)
+        practised_from = takes
+    practice = Pool(tutored.subjects, _names(practised_from, NEW_TAKE_COUNT))
+    return Clips(library, tutored, practice, trials)
 
 
 def _recorded(folder: object) -> Clips:
@@ -117,8 +138,9 @@ def _recorded(folder: object) -> Clips:
         library = RecordedGestures(Path(folder).expanduser())
     except GestureVideoError as error:
         raise UserError(f"task.gestures: {error}") from error
-    return Clips(library, library.subjects, library.takes, library.subjects, library.takes)
+    everything = Pool(library.subjects, library.takes)
+    return Clips(library, everything, everything, everything)
 
 
-def _names(first: int, end: int) -> tuple[str, ...]:
-    return tuple(str(number) for number in range(first, end))
+def _names(first: int, count: int) -> tuple[str, ...]:
+    return tuple(str(number) for number in range(first, first + count))

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from actors.simulator import Scene
-from actors.tasks.contract import Array, Task
+from actors.tasks.contract import Array, Task, corners_of
 from actors.tasks.experiment2 import world
 from actors.tasks.experiment2.baselines import BASELINES, BLINDED
 from actors.tasks.experiment2.clips import OPTIONS, Clips, clips_of, whole_number
@@ -27,6 +27,7 @@ from actors.tasks.experiment2.setting import (
 )
 from proto.config import TaskConfig
 from proto.errors import UserError
+from proto.seeds import TRIALS_BELOW
 from proto.variables import (
     Continuous,
     Discrete,
@@ -77,7 +78,9 @@ class Experiment2(Task):
         )
         self.questions = _questions(self.subtasks)
         self.variables = _variables(self._clips.subjects, self._clips.takes)
-        self._trial_variables = _variables(self._clips.trial_subjects, self._clips.trial_takes)
+        trials, practice = self._clips.trials, self._clips.practice
+        self._trial_variables = _variables(trials.subjects, trials.takes)
+        self._practice_variables = _variables(practice.subjects, practice.takes)
 
     def tutored(self) -> Sequence[Situation]:
         """The paper's eight cases, first with both objects in the middle, then in other poses."""
@@ -93,17 +96,17 @@ class Experiment2(Task):
         return situations
 
     def sample(self, seed: int) -> Situation:
-        """A situation of a trial; the same seed gives the same one."""
-        return sample_situation(self._trial_variables, seed)
+        """A situation of a trial, or of practice or a correction if the seed is one of those.
+
+        The same seed gives the same situation. Practice shows no clip that trials show.
+        """
+        trial = seed < TRIALS_BELOW
+        return sample_situation(self._trial_variables if trial else self._practice_variables, seed)
 
     def corners(self) -> Sequence[Situation]:
         """The situations at the ends of all ranges, for each case of the paper; one clip a side."""
-        clip = {SUBJECT: self._clips.trial_subjects[0], TAKE: self._clips.trial_takes[0]}
-        return [
-            situation
-            for situation in super().corners()
-            if all(situation[name] == value for name, value in clip.items())
-        ]
+        trials = self._clips.trials
+        return corners_of(_variables(trials.subjects[:1], trials.takes[:1]))
 
     def scene(self, situation: Situation) -> Scene:
         """Table, objects, and the screen with the situation's clip.
@@ -175,7 +178,7 @@ def _tutored_clips(clips: Clips, place: Place) -> Iterator[tuple[str, str]]:
     All clips of a side come before one comes again, and kinds and poses tell nothing about them.
     """
     random = np.random.default_rng([_CLIP_SEED, PLACES.index(place)])
-    pairs = list(product(clips.tutored_subjects, clips.tutored_takes))
+    pairs = list(product(clips.tutored.subjects, clips.tutored.takes))
     while True:
         for index in random.permutation(len(pairs)):
             yield pairs[index]

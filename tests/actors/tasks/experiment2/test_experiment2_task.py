@@ -16,6 +16,7 @@ from actors.tasks.registry import make_task
 from proto.config import SimulatorConfig, TaskConfig
 from proto.episode import Kind
 from proto.errors import UserError
+from proto.seeds import CORRECTIONS, PRACTICE, TRIALS_BELOW
 from sim_assets.gestures.drawing import draw_clip
 from sim_assets.gestures.subject import Subject
 
@@ -106,9 +107,9 @@ def test_more_poses_give_more_different_situations():
 
 
 def test_trials_show_new_takes_of_the_tutored_subject():
-    trials = [TASK.sample(seed) for seed in range(200)]
+    trials = [TASK.sample(seed) for seed in range(2000)]
     assert {trial["subject"] for trial in trials} == {"0"}
-    assert {trial["take"] for trial in trials} == {str(take) for take in range(10, 20)}
+    assert {trial["take"] for trial in trials} == {str(take) for take in range(10, 110)}
     assert len({case_of(trial) for trial in trials}) == 8
     assert not clips_of(trials) & clips_of(TASK.tutored())
     for trial in trials:
@@ -117,11 +118,24 @@ def test_trials_show_new_takes_of_the_tutored_subject():
 
 def test_trials_can_show_new_subjects():
     task = experiment2(subjects=4, takes=3, trials_show="new-subjects", poses=3)
-    trials = [task.sample(seed) for seed in range(300)]
+    trials = [task.sample(seed) for seed in range(2000)]
     assert {case["subject"] for case in task.tutored()} == set("0123")
-    assert {trial["subject"] for trial in trials} == {str(seed) for seed in range(4, 12)}
+    assert {trial["subject"] for trial in trials} == {str(subject) for subject in range(4, 54)}
     assert {trial["take"] for trial in trials} == set("012")
     for situation in (*task.tutored(), *trials, *task.corners()):
+        task.check(situation)
+
+
+@pytest.mark.parametrize("shown", ["new-takes", "new-subjects"])
+@pytest.mark.parametrize("seeds", [PRACTICE, CORRECTIONS])
+def test_practice_and_corrections_show_no_clip_of_trials(shown, seeds):
+    task = experiment2(subjects=2, trials_show=shown)
+    practised = [task.sample(seed) for seed in seeds[:2000]]
+    trials = [task.sample(seed) for seed in range(TRIALS_BELOW - 2000, TRIALS_BELOW)]
+    assert not clips_of(practised) & clips_of(trials)
+    assert not clips_of(trials) & clips_of(task.tutored())
+    assert {situation["subject"] for situation in practised} == {"0", "1"}
+    for situation in practised:
         task.check(situation)
 
 
