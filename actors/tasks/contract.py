@@ -224,7 +224,7 @@ class Task(ABC):
 
 
 def corners_of(variables: Sequence[Variable]) -> Sequence[Situation]:
-    """Return all combinations of the ends of continuous variables and the choices of discrete ones."""
+    """Combine the ends of each continuous variable with the choices of each discrete one."""
     ends: list[Sequence[Value]] = [
         (variable.minimum, variable.maximum)
         if isinstance(variable, Continuous)
