@@ -16,7 +16,7 @@ from __future__ import annotations
 import atexit
 import functools
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import mujoco
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from actors.backends import light
 from actors.backends.eye import FAR_M, NEAR_M
 from actors.backends.mujoco import graphics
-from actors.simulator import Array, Image, Scene, Screen
+from actors.simulator import Array, Bodies, Image, Scene, Screen
 from proto.errors import UserError
 from sim_assets.icub_visuals import Colour, Visual
 
@@ -64,8 +64,11 @@ class Renderer:
         self._screen_size = None if scene.screen is None else scene.screen.size_m
         self._model = _compile(robot, self._colours, scene.screen)
         self._data = mujoco.MjData(self._model)
-        names = [self._model.body(number).name for number in range(1, self._model.nbody)]
-        self._places = {name: self._model.body(name).mocapid[0] for name in names}
+        mujoco.mj_kinematics(self._model, self._data)
+        mujoco.mj_camlight(self._model, self._data)  # the light never changes
+        self._links = [self._model.body(number).name for number in range(1, self._model.nbody)]
+        if scene.screen is not None:
+            self._links.remove(_SCREEN)  # the last body
         self._gl: Any = graphics.open_context(driver)
         _open.add(self)
         # Registered after the driver's own exit handler, so that it runs before.
@@ -74,6 +77,8 @@ class Renderer:
         self._gl.make_current()
         self._context = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._options = mujoco.MjvOption()
+        self._unused_camera = mujoco.MjvCamera()
         self.set_scene(scene)
 
     def fits(self, scene: Scene) -> bool:
@@ -98,61 +103,47 @@ class Renderer:
         for flag in _UNUSED_FLAGS:
             self._drawn.flags[flag] = 0
 
-    def place(self, poses: Mapping[str, tuple[Array, Array]], step: int) -> None:
-        """Move every body to its pose, and show the screen's frame of a control step.
-
-        Args:
-            poses: position (3,) and rotation (3, 3) of links and boxes by name.
-            step: the control step.
-        """
-        for name, place in self._places.items():
-            if name != _SCREEN:
-                position, rotation = poses[name]
-                self._data.mocap_pos[place] = position
-                mujoco.mju_mat2Quat(self._data.mocap_quat[place], rotation.ravel())
-        if self._screen is not None:
+    def place(self, poses: Bodies, step: int) -> None:
+        """Move every body to its pose, and show the screen's frame of a control step."""
+        rows = poses.rows[[poses.places[name] for name in self._links]]
+        self._data.mocap_pos[: len(rows)] = rows[:, :3]
+        self._data.mocap_quat[: len(rows)] = rows[:, 3:]
+        if self._screen is not None and step != self._shown_step:
             self._show(self._screen, step)
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mjv_updateScene(
             self._model,
             self._data,
-            mujoco.MjvOption(),
+            self._options,
             None,
-            mujoco.MjvCamera(),
+            self._unused_camera,
             mujoco.mjtCatBit.mjCAT_ALL,
             self._drawn,
         )
+        rotation = np.empty(9)
         for box, code in zip(self._boxes, self._box_codes, strict=True):
-            position, rotation = poses[box.name]
-            mujoco.mjv_initGeom(
-                self._drawn.geoms[self._drawn.ngeom],
-                mujoco.mjtGeom.mjGEOM_BOX,
-                np.array(box.size_m) / 2,
-                position,
-                rotation.ravel(),
-                code,
-            )
+            row = poses.rows[poses.places[box.name]]
+            mujoco.mju_quat2Mat(rotation, row[3:])
+            geom = self._drawn.geoms[self._drawn.ngeom]
+            half = np.array(box.size_m) / 2
+            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_BOX, half, row[:3], rotation, code)
             self._drawn.ngeom += 1
-        _light(self._drawn)
 
-    def picture(
-        self, eye: tuple[Array, Array], width: int, height: int, focal_length: float
-    ) -> Image:
+    def picture(self, eye: Array, width: int, height: int, focal: tuple[float, float]) -> Image:
         """Rendered picture (height, width, 4) uint8, as `actors.backends.eye` describes it.
 
         Args:
-            eye: position (3,) and rotation (3, 3) of the camera: x along the optical axis, y left,
-                z up.
+            eye: pose (4, 4) of the camera in the world: x along the optical axis, y left, z up.
             width: pixels across.
             height: pixels down.
-            focal_length: focal length in these pixels.
+            focal: focal lengths in these pixels, across and down. MuJoCo draws with their mean: its
+                pixels are square. Those of a crop differ by half a percent, as its size is rounded.
         """
-        position, rotation = eye
         for camera in self._drawn.camera:
-            camera.pos, camera.forward, camera.up = position, rotation[:, 0], rotation[:, 2]
+            camera.pos, camera.forward, camera.up = eye[:3, 3], eye[:3, 0], eye[:3, 2]
             camera.frustum_near, camera.frustum_far = NEAR_M, FAR_M
             # Its width follows from the shape of the picture.
-            camera.frustum_top = NEAR_M * height / 2 / focal_length
+            camera.frustum_top = NEAR_M * height / sum(focal)
             camera.frustum_bottom = -camera.frustum_top
         self._gl.make_current()
         if width > self._context.offWidth or height > self._context.offHeight:
@@ -180,14 +171,12 @@ class Renderer:
             self.close()
 
     def _show(self, screen: Screen, step: int) -> None:
-        place = self._places[_SCREEN]
-        self._data.mocap_pos[place] = screen.pose.position_m
-        self._data.mocap_quat[place] = screen.pose.quaternion
-        if step != self._shown_step:
-            self._model.tex_data[:] = _texels(screen.frame(step)).ravel()
-            self._gl.make_current()
-            mujoco.mjr_uploadTexture(self._model, self._context, 0)
-            self._shown_step = step
+        self._data.mocap_pos[-1] = screen.pose.position_m
+        self._data.mocap_quat[-1] = screen.pose.quaternion
+        self._model.tex_data[:] = _texels(screen.frame(step)).ravel()
+        self._gl.make_current()
+        mujoco.mjr_uploadTexture(self._model, self._context, 0)
+        self._shown_step = step
 
 
 def _close_all() -> None:
@@ -202,6 +191,7 @@ def _frame_shape(screen: Screen | None) -> tuple[int, ...] | None:
 def _compile(robot: Sequence[Visual], colours: list[Colour], screen: Screen | None) -> Any:
     """A model with a body for each link that is drawn, and one for the screen."""
     spec = mujoco.MjSpec()
+    _add_light(spec)
     spec.visual.quality.offsamples = 0  # blended codes would be the codes of other colours
     bodies: dict[str, Any] = {}
     for number, visual in enumerate(robot):
@@ -284,18 +274,20 @@ def _table_of(palette: tuple[Colour, ...]) -> NDArray[np.uint32]:
     return seen.view(np.uint32)[..., 0]
 
 
-def _light(drawn: Any) -> None:
+def _add_light(spec: Any) -> None:
     """The light of `actors.backends.light`, as the sum of an even light and three directions."""
     even, slope = (light.SKY + light.GROUND) / 2, (light.SKY - light.GROUND) / 2
-    sources = (
+    spec.visual.headlight.active = 0
+    for towards, diffuse, ambient in (
         (light.TO_SUN, light.SUN, even),
         ((0.0, 0.0, 1.0), slope, 0.0),
         ((0.0, 0.0, -1.0), -slope, 0.0),  # what faces down gets darker
-    )
-    drawn.nlight = len(sources)
-    for source, (towards, diffuse, ambient) in zip(drawn.lights, sources, strict=False):
-        source.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-        source.dir = -np.array(towards)
-        source.attenuation = [1.0, 0.0, 0.0]
-        source.ambient, source.diffuse, source.specular = [ambient] * 3, [diffuse] * 3, [0.0] * 3
-        source.headlight = source.castshadow = 0
+    ):
+        spec.worldbody.add_light(
+            type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            dir=-np.array(towards),
+            ambient=[ambient] * 3,
+            diffuse=[diffuse] * 3,
+            specular=[0.0] * 3,
+            castshadow=False,
+        )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from actors.backends import eye
 from actors.backends.mujoco import graphics
@@ -137,11 +138,10 @@ class MujocoSimulator:
         if self._outside_renderer is None:
             self._outside_renderer = self._make_renderer(self._model.seen_from_outside)
         self._outside_renderer.place(self._world.poses(), self._step)
-        camera = eye.outside_pose()
         factor = eye.OUTSIDE_SUPERSAMPLING
-        focal, _ = eye.outside_focal_lengths(factor * height)
+        focal = eye.outside_focal_lengths(factor * height)
         fine = self._outside_renderer.picture(
-            (camera[:3, 3], camera[:3, :3]), factor * width, factor * height, focal
+            eye.outside_pose(), factor * width, factor * height, focal
         )
         return eye.colours(eye.averaged(fine, factor))
 
@@ -170,11 +170,18 @@ class MujocoSimulator:
             self._eye_renderer = self._make_renderer(self._model.seen_by_eye)
         poses = self._world.poses()
         self._eye_renderer.place(poses, self._step)
-        focal, _ = eye.eye_focal_lengths(crop, width, height)
-        return self._eye_renderer.picture(poses[EYE], width, height, focal)
+        focal = eye.eye_focal_lengths(crop, width, height)
+        return self._eye_renderer.picture(_matrix(poses[EYE]), width, height, focal)
 
     def _make_renderer(self, robot: tuple[Visual, ...]) -> Renderer:
         return Renderer(robot, self._scene, graphics.find_driver())
+
+
+def _matrix(pose: Pose) -> Array:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_quat(pose.quaternion, scalar_first=True).as_matrix()
+    matrix[:3, 3] = pose.position_m
+    return matrix
 
 
 def _renewed(renderer: Renderer | None, scene: Scene) -> Renderer | None:

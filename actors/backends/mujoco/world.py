@@ -123,11 +123,11 @@ class World:
         self._angles = np.array([self._model.joint(name).qposadr[0] for name in builder.joints])
         self._boxes = {box.name: self._model.body(box.name).id for box in scene.boxes}
         # The first body is MuJoCo's own world.
-        self._names = [self._model.body(number).name for number in range(1, self._model.nbody)]
-        self._rows = np.array(
-            [row for row, name in enumerate(self._names, 1) if name not in robot.STATIC_LINKS]
-        )
-        self._places = {self._names[row - 1]: place for place, row in enumerate(self._rows)}
+        names = [self._model.body(number).name for number in range(1, self._model.nbody)]
+        self._places = {name: place for place, name in enumerate(names)}
+        moving = [name for name in names if name not in robot.STATIC_LINKS]
+        self._moving_places = {name: place for place, name in enumerate(moving)}
+        self._moving_rows = np.array([self._places[name] for name in moving])
         self._touches, self._touch_numbers = _touches_of(self._model, scene.boxes)
         self.put(start_rad, {})
         self.drive(start_rad)
@@ -147,7 +147,7 @@ class World:
 
     def touches(self) -> Iterator[tuple[str, str]]:
         """(watched box, toucher) pairs of bodies that overlap now."""
-        if self._data.ncon:
+        if self._touches and self._data.ncon:
             geoms = self._data.contact.geom
             for pairs in (geoms, geoms[:, ::-1]):
                 for number in self._touch_numbers[pairs[:, 0], pairs[:, 1]].tolist():
@@ -174,21 +174,17 @@ class World:
             self._model.body_pos[body] = pose.position_m
             self._model.body_quat[body] = pose.quaternion
 
-    def poses(self) -> dict[str, tuple[Array, Array]]:
-        """Position (3,) and rotation (3, 3) of all links and boxes, by name, for drawing."""
-        rotations = self._data.xmat[1:].reshape(-1, 3, 3)
-        return dict(zip(self._names, zip(self._data.xpos[1:], rotations, strict=True), strict=True))
+    def poses(self) -> Bodies:
+        """Poses of all links and boxes, by name, for drawing."""
+        return Bodies(self._places, np.hstack([self._data.xpos[1:], self._data.xquat[1:]]))
 
     def bodies(self) -> Bodies:
         """Poses of all links that can move and of all boxes, by name."""
-        positions, quaternions = self._data.xpos[self._rows], self._data.xquat[self._rows]
-        return Bodies(self._places, np.concatenate([positions, quaternions], axis=1))
+        return Bodies(self._moving_places, self.poses().rows[self._moving_rows])
 
 
 def _add_box(spec: Any, box: Box) -> None:
-    body = spec.worldbody.add_body(
-        name=box.name, pos=box.pose.position_m, quat=box.pose.quaternion
-    )
+    body = spec.worldbody.add_body(name=box.name, pos=box.pose.position_m, quat=box.pose.quaternion)
     geom = body.add_geom(name=box.name, contype=0, conaffinity=0)
     geom.type = mujoco.mjtGeom.mjGEOM_BOX
     geom.size = np.array(box.size_m) / 2
