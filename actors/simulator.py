@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proto.config import SimulatorConfig
+from proto.errors import UserError
 from proto.extensions import load_class
 
 Array = NDArray[np.float64]

@@ -21,13 +21,15 @@ VARIABLE: Final = "MUJOCO_GL"
 """Environment variable with which the user chooses one of them."""
 TIMEOUT_S: Final = 120.0
 CURE: Final = """\
-MuJoCo renders with OpenGL, by EGL or else by OSMesa, also without a GPU. What provides EGL (as root):
-  Debian and Ubuntu, no NVIDIA card:
+MuJoCo renders with OpenGL, also without a GPU. What provides it (as root):
+  Debian and Ubuntu, no NVIDIA card, by EGL:
     apt-get install libegl1 libopengl0 libgl1-mesa-dri
   NVIDIA card: the driver's own EGL, of the same version as the kernel module (`nvidia-smi`):
     apt-get install libegl1 libopengl0 libnvidia-gl-VERSION (Debian: libegl-nvidia0)
-OSMesa: apt-get install libosmesa6 (Debian 12, Ubuntu 24.04)
-Runs that need no pictures go without them: --set simulator.render=false"""
+  Debian 12 and Ubuntu 24.04, where EGL does not work, by OSMesa:
+    apt-get install libosmesa6
+MuJoCo tries EGL, then OSMesa; the environment variable MUJOCO_GL=osmesa or =egl chooses one.
+Runs that need no pictures go without it: --set simulator.render=false"""
 PACKAGES: Final[Mapping[str, tuple[str, ...]]] = {
     OTHER_SYSTEM: ("libegl1", "libopengl0", "libgl1-mesa-dri"),
 }
