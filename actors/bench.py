@@ -18,7 +18,7 @@ from actors.attention import crop_of_focus, targets_of_action
 from actors.player import LiveStep, play
 from actors.policies.contract import Policy
 from actors.policies.planned import make_tutor
-from actors.simulator import Simulator, make_simulator
+from actors.simulator import Simulator, installed_backends, make_simulator
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from learner.checkpoint import NETWORK_PREFIX, Checkpoint, CheckpointMetadata, CodeRanges
@@ -31,6 +31,7 @@ from proto.body import ACTION_VALUES, FOCUS
 from proto.codec import encode
 from proto.config import Config, NetworkConfig
 from proto.episode import Floats, Image, Kind
+from proto.errors import UserError
 from proto.machine import machine_name
 from proto.messages import Rollout
 from proto.metrics import Stage
@@ -70,6 +71,27 @@ class ActorSpeed:
     steps_per_s: float
     ratio: float
     episode_s: float
+
+
+def bench_backends(config: Config) -> tuple[list[ActorSpeed], dict[str, str]]:
+    """Measure an actor with each installed backend, that of the configuration first.
+
+    Returns:
+        What was measured; and for each backend that cannot run on this machine, why.
+
+    Raises:
+        UserError: the backend of the configuration cannot run on this machine.
+    """
+    chosen = config.simulator.backend
+    speeds, problems = [bench_actor(config)], {}
+    for name in installed_backends():
+        if name != chosen:
+            simulator = config.simulator.model_copy(update={"backend": name})
+            try:
+                speeds.append(bench_actor(config.model_copy(update={"simulator": simulator})))
+            except UserError as error:
+                problems[name] = str(error)
+    return speeds, problems
 
 
 def bench_actor(config: Config) -> ActorSpeed:

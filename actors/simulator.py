@@ -10,6 +10,7 @@ teleported: what is lifted is lifted by friction.
 
 from __future__ import annotations
 
+import importlib.util
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -19,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proto.config import SimulatorConfig
+from proto.errors import UserError
 from proto.extensions import load_class
 
 Array = NDArray[np.float64]
@@ -267,12 +269,13 @@ class Simulator(Protocol):
         """True pose of every box and of every moving link of the robot, by name."""
 
     @abstractmethod
-    def show(self, joints_deg: Array, boxes: Mapping[str, Pose], step: int) -> None:
+    def show(self, joints_deg: Array, bodies: Mapping[str, Pose], step: int) -> None:
         """Put robot, boxes and screen into a recorded state, for pictures; not during an episode.
 
         Args:
             joints_deg: (18,) joint angles, as `joints_deg` measures them.
-            boxes: poses of boxes by name; the others stay where they are.
+            bodies: poses of boxes and links by name; boxes that are not among them stay where they
+                are. With the links of the fingers, these are shown as they were.
             step: control step of the recorded state, which the screen shows.
         """
 
@@ -289,15 +292,36 @@ class Simulator(Protocol):
         """Free what the simulator holds."""
 
 
-BACKENDS: Final[Mapping[str, str]] = {"sapien": "actors.backends.sapien.simulator:SapienSimulator"}
+BACKENDS: Final[Mapping[str, str]] = {
+    "mujoco": "actors.backends.mujoco.simulator:MujocoSimulator",
+    "sapien": "actors.backends.sapien.simulator:SapienSimulator",
+}
+"""The class of each built-in backend; a backend is called as the Python package that it needs."""
+
+
+def is_installed(backend: str) -> bool:
+    """Whether the Python package that a built-in backend needs is installed."""
+    return importlib.util.find_spec(backend) is not None
+
+
+def installed_backends() -> tuple[str, ...]:
+    """Names of the built-in backends whose Python package is installed."""
+    return tuple(name for name in BACKENDS if is_installed(name))
 
 
 def load_backend(name: str) -> type[Simulator]:
     """The class of the backend with a name: one of BACKENDS, or `package.module:Class`.
 
     Raises:
-        UserError: there is no such backend, or it lacks methods of `Simulator`.
+        UserError: there is no such backend, its package is not installed, or it lacks methods of
+            `Simulator`.
     """
+    if name in BACKENDS and not is_installed(name):
+        raise UserError(
+            f"simulator.backend: {name!r} needs a package that is not installed: pip install"
+            f" 'vmdnn[{name}]'; in a checkout, deploy/run_local.sh --backend {name} installs it."
+            f" Installed are: {', '.join(installed_backends())}."
+        )
     return load_class("simulator.backend", name, BACKENDS, Simulator.__abstractmethods__)
 
 

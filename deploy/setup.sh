@@ -1,8 +1,8 @@
 # shellcheck shell=bash
 # Sourced by run_local.sh and test.sh. `setup` installs what this checkout needs to run: Python, a
-# compiler, the locked packages in .venv, and a graphics driver for the simulator. Its arguments are
-# those of run_local.sh, which select the simulator. It installs only what is missing; a second call
-# takes about a second.
+# compiler, the locked packages in .venv, and what the simulator needs: its own packages and a graphics
+# driver. Its arguments are those of run_local.sh, which select the simulator. It installs only what is
+# missing; a second call takes about a second.
 
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="$ROOT/.venv"
@@ -12,7 +12,7 @@ setup() {
     setup_python
     setup_compiler
     setup_packages
-    setup_graphics "$@"
+    setup_simulator "$@"
 }
 
 say() { printf 'setup: %s\n' "$*" >&2; }
@@ -71,13 +71,26 @@ setup_packages() {
     local stamp="$VENV/installed" digest
     digest="$(cat "$LOCK" "$ROOT/pyproject.toml" | sha256sum)"
     [[ -f "$stamp" && "$(<"$stamp")" == "$digest" ]] && return
-    say "installing $(grep -c == "$LOCK") packages into .venv (takes minutes the first time)"
+    say "installing $(grep -v extra "$LOCK" | grep -c ==) packages into .venv (takes minutes the first time)"
     # torch is installed first and with its dependencies, which depend on its build for this machine.
     pip_install --constraint "$LOCK" torch
     pip_install --no-deps --requirement "$LOCK"
     pip_install --no-deps --no-build-isolation --editable "$ROOT"
+    local extra
+    for extra in $(sed -n 's/.*; extra == "\(.*\)"$/\1/p' "$LOCK" | sort -u); do
+        # An extra has the name of the package that a simulator imports.
+        if "$VENV/bin/python" -c "import $extra" 2>/dev/null; then install_extra "$extra"; fi
+    done
     setup_libraries
     printf '%s\n' "$digest" >"$stamp"
+}
+
+# Installs the locked packages of an extra: what one simulator needs and others do not.
+install_extra() {
+    local packages
+    mapfile -t packages < <(sed -n "s/ *; extra == \"$1\"\$//p" "$LOCK")
+    say "installing the packages of $1 (${packages[*]})"
+    pip_install --no-deps "${packages[@]}"
 }
 
 pip_install() {
@@ -96,36 +109,41 @@ setup_libraries() {
 
 imports() {
     (cd "$ROOT" && "$VENV/bin/python" -W ignore -c 'import cv2, pinocchio
-from actors.simulator import BACKENDS, load_backend
-for name in BACKENDS: load_backend(name)')
+from actors.simulator import installed_backends, load_backend
+for name in installed_backends(): load_backend(name)')
 }
 
-# --- graphics ---------------------------------------------------------------------------------
+# --- simulator --------------------------------------------------------------------------------
 
 # Each simulator reports whether it can render, and which packages provide its driver.
-setup_graphics() {
+setup_simulator() {
     local answer packages status=0
-    answer="$(examine_graphics "$@" 2>/dev/null)" || status=$?
+    answer="$(examine_simulator "$@" 2>/dev/null)" || status=$?
+    if ((status == 3)); then
+        install_extra "$answer"
+        status=0
+        answer="$(examine_simulator "$@" 2>/dev/null)" || status=$?
+    fi
     # 2: bad input, such as a simulator that does not exist; run_local.py prints the message
     if ((status == 0 || status == 2)); then return; fi
     read -ra packages <<<"$answer"
     if ((${#packages[@]} == 0)); then
-        examine_graphics "$@" >/dev/null || fail "the simulator cannot render; see above"
+        examine_simulator "$@" >/dev/null || fail "the simulator cannot render; see above"
     fi
     if ! can_install; then
-        examine_graphics "$@" >/dev/null || true
+        examine_simulator "$@" >/dev/null || true
         fail "no graphics driver can render; run this script once as root, or as root:" \
             "$(apt_line "${packages[@]}")"
     fi
     say "installing the graphics driver (${packages[*]})"
     if [[ " ${packages[*]} " == *" bookworm-backports "* ]]; then add_backports; fi
     apt_install "${packages[@]}"
-    examine_graphics "$@" >/dev/null || fail "the graphics driver still cannot render; see above"
+    examine_simulator "$@" >/dev/null || fail "the graphics driver still cannot render; see above"
 }
 
 # Succeeds if the selected simulator can render. Otherwise it prints the packages to install, if any,
-# and writes to standard error what is wrong and what to do.
-examine_graphics() {
+# and writes to standard error what is wrong and what to do. With status 3 it prints the extra to install.
+examine_simulator() {
     "$VENV/bin/python" -m actors.backends --config "$ROOT/deploy/config/experiment1.yaml" "$@"
 }
 

@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# Sets up this checkout as run_local.sh does, then checks it: format, lint, types and tests.
+# Sets up this checkout as run_local.sh does, but with all simulators, then checks it: format, lint, types
+# and tests.
 # Arguments go to pytest: `deploy/test.sh -m slow`, `deploy/test.sh tests/learner -k gradient`.
 set -euo pipefail
 
 # shellcheck source=deploy/setup.sh
 source "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
-setup
+for simulator in sapien mujoco; do setup --backend "$simulator"; done
 cd "$ROOT"
 .venv/bin/ruff format --check .
 .venv/bin/ruff check .

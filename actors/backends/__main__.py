@@ -2,9 +2,11 @@
 
 It takes the arguments of deploy/run_local.sh, and looks at the backend that they choose. What was
 found goes to standard error. If the backend cannot render, the arguments of `apt-get install` that
-provide the graphics driver go to standard output, if any are known.
+provide the graphics driver go to standard output, if any are known. If its Python package is not
+installed, the name of the extra that has it goes there.
 
-Exit status: 0 if the backend can render or the run needs no pictures, 1 if not, 2 for bad input.
+Exit status: 0 if the backend can render or the run needs no pictures, 1 if not, 2 for bad input, 3
+if its Python package is not installed.
 """
 
 from __future__ import annotations
@@ -14,20 +16,29 @@ import platform
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
-from actors.simulator import load_backend
+from actors.simulator import BACKENDS, is_installed, load_backend
 from proto.config import Config, load_config
 from proto.errors import UserError
+
+NOT_INSTALLED: Final = 3
+"""Exit status if the Python package of the backend is not installed."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the diagnosis; the result is the exit status."""
     try:
         config = _config_of(argv)
+        backend = config.simulator.backend
+        if backend in BACKENDS and not is_installed(backend):
+            print(f"the packages of {backend} are not installed", file=sys.stderr)
+            print(backend)
+            return NOT_INSTALLED
         if not config.simulator.render:
             print("no pictures are needed: simulator.render is false", file=sys.stderr)
             return 0
-        diagnosis = load_backend(config.simulator.backend).diagnose()
+        diagnosis = load_backend(backend).diagnose()
     except UserError as error:
         print(error, file=sys.stderr)
         return 2

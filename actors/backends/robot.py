@@ -6,15 +6,17 @@ Angles of motors are in the order of `Observation.joints_deg`: neck (2), arm (7)
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from actors.simulator import Array, JointTargets
+from actors.simulator import Array, JointTargets, Pose
 from proto.cache import cache_folder
 from proto.errors import UserError
-from sim_assets.hand import joints_from_motors, motors_from_joints
+from sim_assets.hand import PHALANGES, joints_from_motors, motors_from_joints
 from sim_assets.icub import ARM_JOINTS, NECK_JOINTS, IcubModel, build_icub
 
 MOTOR_COUNT: Final = 18
@@ -87,6 +89,31 @@ def joints_from_motors_rad(motors_deg: Array) -> Array:
     hand_deg = joints_from_motors(motors_deg[..., _BEFORE_HAND:])
     joints_deg = np.concatenate([motors_deg[..., :_BEFORE_HAND], hand_deg], axis=-1)
     return np.asarray(np.deg2rad(joints_deg), dtype=np.float64)
+
+
+def recorded_joints_rad(joints_deg: Array, bodies: Mapping[str, Pose]) -> Array:
+    """Angles (28,) of all joints, in radians, of a recorded state.
+
+    Fingers that hold something differ from what the angles of their motors say. Where the poses of
+    their links are known, their angles follow from these.
+
+    Args:
+        joints_deg: (18,) motor angles in degrees.
+        bodies: poses of bodies by name.
+    """
+    joints_rad = joints_from_motors_rad(joints_deg)
+    for place, phalanx in enumerate(PHALANGES, _BEFORE_HAND):
+        if {phalanx.parent, phalanx.link} <= bodies.keys():
+            before = _rotation(bodies[phalanx.parent]) * Rotation.from_euler(
+                "z", phalanx.parent_yaw_deg, degrees=True
+            )
+            turn = before.inv() * _rotation(bodies[phalanx.link])
+            joints_rad[place] = turn.as_rotvec() @ np.array(phalanx.axis)
+    return joints_rad
+
+
+def _rotation(pose: Pose) -> Rotation:
+    return Rotation.from_quat(pose.quaternion, scalar_first=True)
 
 
 def motors_from_joints_deg(joints_rad: Array) -> Array:

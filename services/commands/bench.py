@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from actors.bench import bench_actor
+from actors.bench import bench_backends
 from learner.bench.bptt import bench_bptt
+from proto.config import Config
 from services.arguments.common import add_config, config_of, positive
 
 
@@ -18,7 +20,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
     subjects = parser.add_subparsers(dest="subject", metavar="SUBJECT", required=True)
     actor = subjects.add_parser(
-        "actor", help="physics, rendering, the network's step, and the actor's whole loop"
+        "actor",
+        help="physics, rendering, the network's step, and the actor's whole loop, in each installed"
+        " simulator",
     )
     bptt = subjects.add_parser(
         "bptt", help="one epoch of coupled training, compared with other implementations"
@@ -40,20 +44,35 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure and print the speeds."""
     config = config_of(arguments)
     if arguments.subject == "actor":
-        speed = _rounded(asdict(bench_actor(config)))
-    else:
-        measured = bench_bptt(
-            config,
-            batch=arguments.batch,
-            steps=arguments.steps,
-            threads=arguments.threads,
-        )
-        speed = _rounded(asdict(measured))
+        return _run_actor(config, as_json=arguments.json)
+    measured = bench_bptt(
+        config,
+        batch=arguments.batch,
+        steps=arguments.steps,
+        threads=arguments.threads,
+    )
+    speed = _rounded(asdict(measured))
     if arguments.json:
         print(json.dumps(speed))
     else:
         for name, value in speed.items():
             print(f"{name:12} {value}")
+    return 0
+
+
+def _run_actor(config: Config, *, as_json: bool) -> int:
+    """Measure all installed simulators, and print them beside each other."""
+    measured, problems = bench_backends(config)
+    speeds = [_rounded(asdict(speed)) for speed in measured]
+    for name, problem in problems.items():
+        print(f"{name} is left out: {problem}", file=sys.stderr)
+    if as_json:
+        chosen, *others = speeds
+        print(json.dumps({**chosen, "others": others}))
+    else:
+        print(f"{'machine':17} {speeds[0].pop('machine')}")
+        for name in speeds[0]:
+            print(f"{name:17}", *(f"{speed[name]!s:10}" for speed in speeds))
     return 0
 
 

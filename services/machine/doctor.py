@@ -76,8 +76,12 @@ def check_python() -> Finding:
 
 
 def check_locked_packages(lock: Path) -> Finding:
-    """Check that every locked package is installed in the locked version."""
-    locked = read_lock(lock)
+    """Check that every locked package is installed in the locked version.
+
+    Packages of extras may be missing.
+    """
+    extras = read_lock(lock, extras=True)
+    locked = read_lock(lock) | {name: extras[name] for name in extras if _installed(name)}
     differing = [
         f"{name} {installed or 'missing'} instead of {wanted}"
         for name, wanted in locked.items()
@@ -176,10 +180,16 @@ def check_graphics(config: SimulatorConfig) -> Finding:
     return Finding("graphics", diagnosis.found, diagnosis.cure or "the backend names no cure")
 
 
-def read_lock(lock: Path) -> dict[str, str]:
-    """Read the version of each locked package by name."""
+def read_lock(lock: Path, *, extras: bool = False) -> dict[str, str]:
+    """Read the version of each locked package by name.
+
+    Args:
+        lock: the file.
+        extras: read the packages that only an extra needs, instead of all others.
+    """
     lines = (line.partition("#")[0].strip() for line in lock.read_text().splitlines())
-    pairs = (line.partition("==") for line in lines if line)
+    packages = (line.partition(";") for line in lines if line)
+    pairs = (text.strip().partition("==") for text, _, extra in packages if bool(extra) == extras)
     return {name: wanted for name, _, wanted in pairs}
 
 

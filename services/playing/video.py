@@ -73,13 +73,11 @@ def write_video(
 
 def frames(episode: Episode, simulator: Simulator, task: Task) -> Iterator[Picture]:
     """Yield one picture (480, 1280, 3) uint8, RGB, for each step of an episode of a task."""
-    scene = task.scene(episode.situation)
-    simulator.reset(scene)
-    boxes = {box.name for box in scene.boxes}
+    simulator.reset(task.scene(episode.situation))
     for step in range(episode.steps):
         poses = _poses(episode, step)
         joints_deg = episode.joints_deg[step].astype(np.float64)
-        simulator.show(joints_deg, {name: poses[name] for name in boxes & poses.keys()}, step)
+        simulator.show(joints_deg, poses, step)
         outside = simulator.outside_picture(PANEL_WIDTH, PANEL_HEIGHT).copy()
         _write_lines(outside, _caption(episode, step))
         focus = _focus_before(episode, step, float(task.start[FOCUS]))

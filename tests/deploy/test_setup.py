@@ -76,9 +76,9 @@ def test_a_machine_that_is_set_up_is_not_changed(tmp_path: Path) -> None:
 
 
 def set_up_graphics(bare: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """`setup_graphics` on a machine without a graphics driver and without apt-get."""
+    """`setup_simulator` on a machine without a graphics driver and without apt-get."""
     venv = Path(sys.executable).parents[1]
-    script = f'set -euo pipefail; source {DEPLOY / "setup.sh"}; VENV={venv}; setup_graphics "$@"'
+    script = f'set -euo pipefail; source {DEPLOY / "setup.sh"}; VENV={venv}; setup_simulator "$@"'
     return call(
         *("bash", "-c", script, "setup", *arguments),
         path=bare / "bin",
@@ -103,6 +103,39 @@ def test_no_driver_is_installed_if_it_would_not_help(bare: Path, arguments: list
     """Without rendering none is needed; run_local.py reports wrong arguments."""
     answer = set_up_graphics(bare, *arguments)
     assert (answer.returncode, answer.stderr) == (0, "")
+
+
+HIDE_MUJOCO = """
+import importlib.util, os
+
+found = importlib.util.find_spec
+def find_spec(name, package=None):
+    hidden = name == "mujoco" and not os.path.exists(os.environ["INSTALLED"])
+    return None if hidden else found(name, package)
+importlib.util.find_spec = find_spec
+"""
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "sapien"])
+def test_only_the_chosen_simulators_packages_are_installed(bare: Path, backend: str) -> None:
+    """Until pip is called, Python finds no package called mujoco."""
+    (bare / "sitecustomize.py").write_text(HIDE_MUJOCO)
+    venv = Path(sys.executable).parents[1]
+    script = (
+        f"set -euo pipefail; source {DEPLOY / 'setup.sh'}; VENV={venv}\n"
+        'pip_install() { echo "pip install $*"; printf "" >"$INSTALLED"; }\n'
+        'setup_simulator "$@"'
+    )
+    answer = call(
+        *("bash", "-c", script, "setup", "--backend", backend, "--set", "simulator.render=false"),
+        cwd=bare,
+        PYTHONPATH=os.pathsep.join([str(bare), str(DEPLOY.parent)]),
+        INSTALLED=str(bare / "installed"),
+    )
+    assert answer.returncode == 0, answer.stderr
+    locked = re.findall(r"^(\S+) ; extra", (DEPLOY / "requirements.lock").read_text(), re.MULTILINE)
+    expected = f"pip install --no-deps {' '.join(locked)}\n" if backend == "mujoco" else ""
+    assert answer.stdout == expected
 
 
 def test_the_message_of_a_backend_without_packages_is_printed(bare: Path) -> None:

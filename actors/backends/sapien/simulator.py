@@ -15,6 +15,7 @@ from actors.backends.robot import (
     motor_ramp_deg,
     motors_from_joints_deg,
     motors_of,
+    recorded_joints_rad,
 )
 from actors.backends.sapien import graphics
 from actors.backends.sapien.renderer import Renderer
@@ -59,7 +60,7 @@ class SapienSimulator:
         self._builder = RobotBuilder(self._model)
         self._eye_renderer: Renderer | None = None
         self._outside_renderer: Renderer | None = None
-        self._scene: Scene | None = None
+        self._current_scene: Scene | None = None
         self._current_world: World | None = None
         self._targets_deg = np.zeros(MOTOR_COUNT)
         self._step = 0
@@ -74,7 +75,7 @@ class SapienSimulator:
 
     def reset(self, scene: Scene) -> None:
         """Replace the previous scene by `scene`; the same scene gives the same episode."""
-        self._scene = scene
+        self._current_scene = scene
         self._step = 0
         self._targets_deg = motors_of(scene.start)
         self._current_world = World(
@@ -130,15 +131,17 @@ class SapienSimulator:
             self._bodies = self._world.bodies()
         return self._bodies
 
-    def show(self, joints_deg: Array, boxes: Mapping[str, Pose], step: int) -> None:
+    def show(self, joints_deg: Array, bodies: Mapping[str, Pose], step: int) -> None:
         """Put robot, boxes and screen into a recorded state, for pictures; not during an episode.
 
         Args:
             joints_deg: (18,) joint angles, as `joints_deg` measures them.
-            boxes: poses of boxes by name; the others stay where they are.
+            bodies: poses of boxes and links by name; boxes that are not among them stay where they
+                are. With the links of the fingers, these are shown as they were.
             step: control step of the recorded state, which the screen shows.
         """
-        self._world.put(joints_from_motors_rad(joints_deg), boxes)
+        boxes = {box.name: bodies[box.name] for box in self._scene.boxes if box.name in bodies}
+        self._world.put(recorded_joints_rad(joints_deg, bodies), boxes)
         self._step = step
         self._forget()
 
@@ -170,6 +173,12 @@ class SapienSimulator:
             raise RuntimeError("call reset(scene) first")
         return self._current_world
 
+    @property
+    def _scene(self) -> Scene:
+        if self._current_scene is None:
+            raise RuntimeError("call reset(scene) first")
+        return self._current_scene
+
     def _forget(self) -> None:
         """Discard what was measured: the robot or a box may have moved."""
         self._joints_deg = self._bodies = None
@@ -185,6 +194,5 @@ class SapienSimulator:
 
     def _make_renderer(self, robot: tuple[Visual, ...]) -> Renderer:
         renderer = Renderer(robot)
-        if self._scene is not None:
-            renderer.set_scene(self._scene)
+        renderer.set_scene(self._scene)
         return renderer

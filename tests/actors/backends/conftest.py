@@ -1,10 +1,10 @@
-"""Runs the conformance suite on all built-in backends, or on that of `--backend`."""
+"""Runs the conformance suite on all installed built-in backends, or on that of `--backend`."""
 
 from __future__ import annotations
 
 import pytest
 
-from actors.simulator import BACKENDS
+from actors.simulator import installed_backends
 
 OPTION = "--backend"
 
@@ -20,7 +20,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     if "backend" in metafunc.fixturenames:
         chosen = _chosen(metafunc.config)
-        names = sorted(BACKENDS) if chosen is None else [chosen]
+        names = installed_backends() if chosen is None else [chosen]
         metafunc.parametrize("backend", names, scope="session")
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import platform
+import re
 from pathlib import Path
 
 import pytest
 
 from actors.backends.__main__ import main
+from actors.simulator import BACKENDS
 
 DARK_BACKEND = """
 from actors.backends.sapien.simulator import SapienSimulator
@@ -91,3 +93,26 @@ def test_bad_input_gives_status_2(
     printed = capsys.readouterr()
     assert printed.out == ""
     assert message in printed.err
+
+
+def test_a_backend_whose_package_is_missing_gives_status_3(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("actors.backends.__main__.is_installed", lambda name: name != "mujoco")
+    assert main(["--backend", "mujoco", "--set", "simulator.render=false"]) == 3
+    assert capsys.readouterr() == ("mujoco\n", "the packages of mujoco are not installed\n")
+
+
+def test_only_backends_name_a_graphics_driver():
+    root = Path(__file__).parents[3]
+    packages = ("proto", "sim_assets", "learner", "actors", "services", "deploy")
+    naming = [
+        str(file.relative_to(root))
+        for package in packages
+        for pattern in ("*.py", "*.sh", "*.yaml")
+        for file in (root / package).rglob(pattern)
+        if re.search(r"vulkan|\begl\b|\bmesa\b|LP_NUM_THREADS", file.read_text(), re.IGNORECASE)
+    ]
+    assert naming
+    folders = tuple(f"actors/backends/{backend}/" for backend in BACKENDS)
+    assert all(name.startswith(folders) for name in naming), naming

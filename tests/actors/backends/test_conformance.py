@@ -1,11 +1,15 @@
 """Requirements for every backend: frames, control, contact, repeatability and pictures.
 
-The suite runs on all built-in backends, or on one of your own; see docs/your-own-simulator.md.
+The suite runs on all installed built-in backends, or on one of your own; see
+docs/your-own-simulator.md.
 """
 
 from __future__ import annotations
 
+import gc
 import math
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -14,6 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
+from actors.attention import crop_of_focus
 from actors.backends import light
 from actors.backends.eye import SKY
 from actors.simulator import (
@@ -202,6 +207,47 @@ def test_touches_of_unwatched_bodies_are_not_reported(blind):
     assert blind.step(targets()).touches == frozenset()  # though the object stands on the table
 
 
+@pytest.mark.parametrize("height_m", [0.0, 0.06])
+def test_a_touch_lasts_from_the_first_overlap_on(blind, height_m):
+    """A box that stands on a watched one touches it in each step; one that falls, when it lands."""
+    plate = Box("plate", (0.1, 0.1, 0.02), Pose((0.0, 0.3, 0.5)), (1, 1, 1), watched=True)
+    centre = Pose((0.0, 0.3, 0.53 + height_m))
+    box = Box("box", (0.04, 0.04, 0.04), centre, (1, 1, 1), mass_kg=0.1)
+    blind.reset(scene(plate, box))
+    touched = [("plate", "box") in blind.step(targets()).touches for _ in range(6)]
+    assert touched[0] == (height_m == 0.0)  # it needs 0.11 s to fall so far
+    assert all(touched[2:])
+
+
+@pytest.mark.parametrize(
+    ("slope_deg", "frictions", "slides"),
+    [
+        (20, (1.0, 0.0), False),  # tan 0.36: the mean holds the box, the smaller would not
+        (20, (0.2, 0.2), True),
+        (35, (1.0, 0.2), True),  # tan 0.70: the mean does not hold it, the greater would
+        (35, (1.0, 0.6), False),
+    ],
+)
+def test_friction_between_two_bodies_is_the_mean_of_both(blind, slope_deg, frictions, slides):
+    tilt = math.radians(slope_deg)
+    turn = (math.cos(tilt / 2), math.sin(tilt / 2), 0.0, 0.0)
+    up = 0.03 * np.array((0.0, -math.sin(tilt), math.cos(tilt)))
+    plate, box = (
+        Box(name, size, Pose(tuple(np.array((0.0, 0.3, 0.5)) + shift), turn), (1, 1, 1),
+            mass_kg=mass, friction=friction)
+        for name, size, shift, mass, friction in zip(
+            ("plate", "box"), ((0.4, 0.4, 0.02), (0.08, 0.08, 0.04)), (0.0 * up, up), (None, 0.1),
+            frictions, strict=True,
+        )
+    )  # fmt: skip
+    blind.reset(scene(plate, box))
+    for _ in range(5):
+        blind.step(targets())
+    way_m = np.linalg.norm(np.subtract(blind.bodies()["box"].position_m, box.pose.position_m))
+    assert (way_m > 0.02) == slides
+    assert slides or way_m < 0.003
+
+
 def rotation(quaternion):
     w, x, y, z = quaternion
     return np.array(
@@ -247,6 +293,85 @@ def test_another_simulator_gives_the_same_episode(seeing, another):
     assert trace(another()) == trace(seeing)
 
 
+def test_a_simulator_that_is_collected_harms_no_other(seeing, another, backend):
+    seeing.reset(scene())
+    before = seeing.observe(Crop()).image
+    forgotten = make_simulator(SimulatorConfig(backend=backend))
+    forgotten.reset(scene())
+    forgotten.observe(Crop())
+    forgotten.outside_picture(64, 48)
+    del forgotten
+    gc.collect()
+    assert np.array_equal(seeing.observe(Crop()).image, before)
+    late = another()
+    late.reset(scene())
+    assert np.array_equal(late.observe(Crop()).image, before)
+
+
+GROWTH_PROGRAM = """
+import sys
+from pathlib import Path
+from actors.simulator import Crop, make_simulator
+from actors.tasks.experiment2.task import Experiment2
+from proto.config import SimulatorConfig, TaskConfig
+
+backend, makings, resets = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+task = Experiment2(TaskConfig(name="experiment2"))
+scenes = [task.scene(situation) for situation in task.tutored()[:4]]
+
+def memory_mb():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6
+
+def play(simulator, resets):
+    for number in range(resets):
+        scene = scenes[number % len(scenes)]
+        simulator.reset(scene)
+        simulator.step(scene.start)
+        simulator.observe(Crop())
+
+for making in range(makings):
+    simulator = make_simulator(SimulatorConfig(backend=backend))
+    play(simulator, 20)
+    if making == makings // 6:
+        before = memory_mb()
+    if making < makings - 1:
+        simulator.close()
+play(simulator, 30)
+before = before if makings > 1 else memory_mb()
+play(simulator, resets)
+print(memory_mb() - before)
+"""
+
+
+def growth_mb(backend: str, makings: int, resets: int) -> float:
+    """Growth of a process that makes and closes simulators, and resets the last one."""
+    arguments = [backend, str(makings), str(resets)]
+    result = subprocess.run(
+        [sys.executable, "-c", GROWTH_PROGRAM, *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return float(result.stdout)
+
+
+def test_memory_stays_the_same_over_many_episodes(backend):
+    assert growth_mb(backend, makings=1, resets=300) < 5.0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_memory_stays_the_same_over_thousands_of_episodes(backend):
+    assert growth_mb(backend, makings=1, resets=3000) < 5.0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_what_is_closed_is_freed(backend):
+    """Of what the driver allocates for a simulator, it may keep some for the next."""
+    assert growth_mb(backend, makings=60, resets=0) < 20.0
+
+
 # --- pictures ---------------------------------------------------------------------------------
 
 
@@ -279,6 +404,22 @@ def grey_at(simulator, point_m):
     return float(simulator.observe(Crop()).image[seen_at(simulator, point_m, 64, 48)])
 
 
+@pytest.mark.parametrize("level", [1.0, 6.6, 13.2, 20.0])
+def test_a_crop_keeps_its_shape(seeing, level):
+    """A small box off the middle is seen where a camera with square pixels sees it."""
+    x, y, z = SCREEN_CENTRE
+    centre = (x + 0.05, y, z + 0.04)
+    mark = Box("mark", (0.01, 0.01, 0.01), Pose(centre), (0.0, 0.9, 0.0))
+    seeing.reset(scene(mark, start=targets(neck=(0.0, 0.0))))
+    crop = crop_of_focus(level)
+    picture = seeing.eye_picture(crop, 640, 480).astype(int)
+    rows, columns = np.nonzero(picture[..., 1] - picture[..., 0] > 60)
+    row, column = seen_at(seeing, centre, 640, 480)
+    magnified = 240 / (240 - 6 * (level - 1))
+    expected = (240 + magnified * (row + 0.5 - 240), 320 + magnified * (column + 0.5 - 320))
+    assert (rows.mean() + 0.5, columns.mean() + 0.5) == pytest.approx(expected, abs=2.5)
+
+
 def test_hand_object_obstacle_and_table_have_different_brightness(seeing):
     seeing.reset(scene())
     hand = grey_at(seeing, seeing.bodies()["r_middle_1"].position_m)
@@ -303,6 +444,32 @@ def test_a_recorded_state_can_be_shown_again(seeing):
     assert np.abs(seeing.eye_picture(Crop(), 160, 120).astype(int) - picture).mean() < 0.5
     for name in ("r_hand_dh_frame", "object", "head"):
         assert seeing.bodies()[name].position_m == pytest.approx(bodies[name].position_m, abs=1e-3)
+
+
+def test_fingers_that_hold_something_are_shown_as_they_were(seeing):
+    """A box stops the fingers, so that their joints differ from what their motors' angles say."""
+    seeing.reset(scene(TABLE, start=targets(level=1.0)))
+    palm = seeing.bodies()["r_hand_dh_frame"]
+    place = np.array(palm.position_m) + rotation(palm.quaternion) @ np.array((0.05, 0.0, 0.03))
+    held = Box("held", (0.04, 0.04, 0.04), Pose(tuple(place), palm.quaternion), (0, 0, 1))
+    start = scene(TABLE, held, start=targets(level=1.0))
+    seeing.reset(start)
+    for level in np.linspace(1.0, 20.0, 10):
+        seeing.step(targets(level=level))
+    joints, bodies = seeing.joints_deg(), dict(seeing.bodies())
+    picture = seeing.eye_picture(Crop(), 320, 240)
+    fingers = [name for name in bodies if name.startswith("r_") and name[-1].isdigit()]
+
+    def errors_m():
+        shown = seeing.bodies()
+        return [math.dist(shown[name].position_m, bodies[name].position_m) for name in fingers]
+
+    seeing.reset(start)
+    seeing.show(joints, {}, 10)
+    assert max(errors_m()) > 5e-3, "the motors' angles do not tell all"
+    seeing.show(joints, bodies, 10)
+    assert max(errors_m()) < 2e-4
+    assert np.abs(seeing.eye_picture(Crop(), 320, 240).astype(int) - picture).mean() < 0.1
 
 
 @pytest.mark.parametrize(

@@ -146,17 +146,3 @@ def test_the_shader_has_the_shared_light():
     assert {name: float(number) for name, number in numbers.items()} == {
         "SUN": light.SUN, "SKY": light.SKY, "GROUND": light.GROUND, "GAMMA": light.GAMMA,
     }  # fmt: skip
-
-
-def test_no_other_module_names_its_driver():
-    root = Path(renderer.__file__).parents[3]
-    packages = ("proto", "sim_assets", "learner", "actors", "services", "deploy")
-    naming = [
-        str(file.relative_to(root))
-        for package in packages
-        for pattern in ("*.py", "*.sh", "*.yaml")
-        for file in (root / package).rglob(pattern)
-        if re.search(r"vulkan|\bmesa\b|LP_NUM_THREADS", file.read_text(), re.IGNORECASE)
-    ]
-    assert naming
-    assert all(name.startswith("actors/backends/sapien/") for name in naming), naming

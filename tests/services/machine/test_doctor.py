@@ -63,6 +63,14 @@ def test_other_and_missing_packages_are_named(tmp_path: Path) -> None:
     assert str(lock) in finding.advice
 
 
+def test_packages_of_an_extra_may_be_missing_but_not_differ(tmp_path: Path) -> None:
+    lock = tmp_path / "requirements.lock"
+    lock.write_text('no-such-package==1.0 ; extra == "such"\n')
+    assert check_locked_packages(lock).ok
+    lock.write_text('rich==0.0.1 ; extra == "such"\n')
+    assert f"rich {version('rich')} instead of 0.0.1" in check_locked_packages(lock).found
+
+
 def test_without_a_lock_it_checks_the_requirements_of_the_distribution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
