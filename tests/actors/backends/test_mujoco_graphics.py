@@ -83,8 +83,7 @@ def test_without_a_driver_every_remedy_is_named() -> None:
 def test_the_simulator_refuses_with_the_same_message(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(UserError, match="apt-get install libegl1"):
         make_simulator(SimulatorConfig(backend="mujoco"))
-    command = "evaluate --policy tutor --trials 1 --workers 1 --backend mujoco"
-    assert main(command.split()) == 2
+    assert main(["bench", "actor", "--set", "simulator.backend=mujoco"]) == 2
     printed = capsys.readouterr()
     assert "apt-get install libegl1" in printed.err
     assert "Traceback" not in printed.err
