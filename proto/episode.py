@@ -109,6 +109,8 @@ class Outcome:
 
 SIMULATION_FAILED: Final = Outcome(False, False, False, "simulation_failed", {})
 """Outcome of a trial whose simulation failed; it has no measures."""
+UNKNOWN_OUTCOME: Final = Outcome(False, False, False, "unknown", {})
+"""Outcome of a sequence that nobody judged, such as one that was imported."""
 
 
 Axes = Annotated[tuple[float, float, float], Many(Number(0.0, 1e3), Size("axes", 3, 3))]
@@ -155,7 +157,8 @@ class Episode:
         id: random hexadecimal id, unique.
         kind: why it was played.
         task: name of the task.
-        situation: the values of the task's variables by name, in the paper's task frame.
+        situation: the values of the task's variables by name, in the paper's task frame; empty if
+            they are not known.
         seed: seed of all random numbers in the episode.
         actor: id of the process that played it.
         backend: name of the simulator.

@@ -18,6 +18,7 @@ from actors.tasks.registry import make_task
 from proto.body import FOCUS
 from proto.config import Config
 from proto.episode import NO_FAILURE, Episode, Outcome
+from proto.errors import UserError
 from proto.variables import situation_text
 from services.playing.video_file import Picture, check_video_name, video_file
 
@@ -55,6 +56,8 @@ def write_video(
             needs an option of the task, or the file cannot be written.
     """
     check_video_name(out)
+    if not episode.situation:
+        raise UserError(f"the situation of {episode.id} is not known, so there is no scene to show")
     rate = fps or 1.0 / episode.control_period_s
     with (
         closing(make_simulator(config.simulator.model_copy(update={"render": True}))) as simulator,

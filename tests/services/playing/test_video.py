@@ -62,6 +62,11 @@ def test_the_video_shows_both_views_of_every_step(short: Path, tmp_path: Path) -
         assert (moved > 50).any(axis=2)[:, 640:].sum() > 500
 
 
+def test_recordings_are_exported_as_videos(short: Path, tmp_path: Path) -> None:
+    assert main(["export", str(short.parent), "--format", "video", "--out", str(tmp_path)]) == 0
+    assert len(read_video(tmp_path / f"{read_episode(short).id}.mp4")[0]) == len(STEPS)
+
+
 def test_the_recorded_picture_agrees_with_the_rendered_view(short: Path, tmp_path: Path) -> None:
     """The inset is what the network was given; the frame says where it lies in the eye's view."""
     out = tmp_path / "episode.mp4"
