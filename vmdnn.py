@@ -187,8 +187,9 @@ def read_episode(path: str | Path) -> Episode:
 def write_episode(path: str | Path, episode: Episode) -> None:
     """Record an episode as an MCAP file."""
     from proto.recordings.episodes import write_episode as write  # noqa: PLC0415
+    from services.robot_meshes import robot_meshes  # noqa: PLC0415
 
-    write(Path(path), episode)
+    write(Path(path), episode, robot=robot_meshes())
 
 
 def tutor(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from actors.attention import clip_action, crop_of_focus, targets_of_action, with
 from actors.policies.contract import Policy
 from actors.simulator import Simulator
 from actors.tasks.contract import Task
+from actors.view import view_of
 from proto.body import FOCUS
 from proto.episode import Episode, Image, Kind
 from proto.variables import Situation
@@ -72,14 +74,17 @@ def play(
         UserError: the situation is not valid for the task.
     """
     task.check(situation)
-    simulator.reset(task.scene(situation))
+    started_s = time.time()
+    scene = task.scene(situation)
+    simulator.reset(scene)
     judge = task.judge(situation)
     policy.begin(situation, seed)
     names = tuple(simulator.bodies().places)
-    images, actions, targets, joints, poses, outputs = [], [], [], [], [], []
+    images, crops, actions, targets, joints, poses, outputs = [], [], [], [], [], [], []
     focus = float(task.start[FOCUS])
     for step, phase in enumerate(task.phases):
-        seen = simulator.observe(crop_of_focus(focus))
+        crops.append(crop_of_focus(focus))
+        seen = simulator.observe(crops[-1])
         action = _with_task_attention(task, clip_action(policy.step(seen.image)))
         poses.append(simulator.bodies().rows)
         if on_step is not None:
@@ -117,6 +122,8 @@ def play(
         outcome=judge.outcome(),
         outputs=np.asarray(outputs, dtype=np.float32) if outputs else None,
         control_period_s=simulator.control_period_s,
+        started_s=started_s,
+        view=view_of(scene, crops),
     )
 
 

@@ -109,6 +109,41 @@ class Outcome:
 
 SIMULATION_FAILED: Final = Outcome(False, False, False, "simulation_failed", {})
 """Outcome of a trial whose simulation failed; it has no measures."""
+UNKNOWN_OUTCOME: Final = Outcome(False, False, False, "unknown", {})
+"""Outcome of a sequence that nobody judged, such as one that was imported."""
+
+
+Axes = Annotated[tuple[float, float, float], Many(Number(0.0, 1e3), Size("axes", 3, 3))]
+
+
+@dataclass(frozen=True)
+class BoxLook:
+    """How a box looks.
+
+    Attributes:
+        size_m: full edge lengths along its own x, y, z (m).
+        colour: red, green, blue in 0..1, linear.
+    """
+
+    size_m: Axes
+    colour: Axes
+
+
+@dataclass(frozen=True)
+class View:
+    """What a viewer needs besides the poses of what moves.
+
+    Attributes:
+        boxes: the boxes by name; their poses are among the episode's bodies.
+        fixed_links: (7,) float32 of each link of the robot that never moves, by name: position (m)
+            and quaternion (w first) in the world frame.
+        focal_px: (T, 2) float32, focal lengths across and down of the camera that took images[t],
+            in pixels of this image; the optical axis is in the image's middle.
+    """
+
+    boxes: Annotated[Mapping[str, BoxLook], Table(record_of(BoxLook), most=256)]
+    fixed_links: Annotated[Mapping[str, Floats], Table(Array("float32", (7,), -1e3, 1e3), most=256)]
+    focal_px: Annotated[Floats, Array("float32", (STEPS, 2), 1e-3, 1e6)]
 
 
 @dataclass(frozen=True)
@@ -122,7 +157,8 @@ class Episode:
         id: random hexadecimal id, unique.
         kind: why it was played.
         task: name of the task.
-        situation: the values of the task's variables by name, in the paper's task frame.
+        situation: the values of the task's variables by name, in the paper's task frame; empty if
+            they are not known.
         seed: seed of all random numbers in the episode.
         actor: id of the process that played it.
         backend: name of the simulator.
@@ -144,6 +180,8 @@ class Episode:
         states: activity (T, units) float32 of each subnet by name; None if it was not recorded.
         training: id of the training that the policy comes from; empty for the tutor and for a
             policy from a file.
+        started_s: when it was played, Unix time (s); None if this is not known.
+        view: what a viewer needs besides; None if this is not known.
     """
 
     id: Id
@@ -174,6 +212,8 @@ class Episode:
         Added(Table(Array("float32", (STEPS, Size("units", 1, 65536, varies=True))), most=16)),
     ] = field(default=None)
     training: Annotated[str, Text(64)] = ""
+    started_s: Annotated[float | None, Added(Number(0.0, 1e10))] = None
+    view: Annotated[View | None, Added(record_of(View))] = None
 
     def __post_init__(self) -> None:
         """Raise ValueError if a step's phase has no name."""

@@ -45,7 +45,7 @@ class PolicyVersion:
     weights: Annotated[bytes, Blob(POLICY_LIMIT)]
 
 
-@message("sequence", 3, limit=EPISODE_LIMIT)
+@message("sequence", 4, limit=EPISODE_LIMIT)
 @dataclass(frozen=True)
 class Sequence:
     """A tutored episode or a correction, from an actor to the learner."""
@@ -53,7 +53,7 @@ class Sequence:
     episode: Episode
 
 
-@message("rollout", 2, limit=EPISODE_LIMIT)
+@message("rollout", 3, limit=EPISODE_LIMIT)
 @dataclass(frozen=True)
 class Rollout:
     """An episode that a network played as a trial or in practice, from an actor to the evaluator.

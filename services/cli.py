@@ -38,6 +38,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "compare": ("services.commands.compare", "train and test VMDNN and other networks"),
     "figure": ("services.commands.figure", "draw a figure of the paper, or of failures"),
     "replay": ("services.commands.replay", "make a video of a recorded episode"),
+    "export": ("services.commands.export", "write recordings in a format of others"),
+    "import": ("services.commands.import_sequences", "learn from what others have recorded"),
     "recover": ("services.commands.recover", "repair a truncated MCAP file"),
     "inspect": ("services.commands.inspect", "show a network, a checkpoint, a task or its vision"),
     "bench": ("services.commands.bench", "measure speed on this machine"),

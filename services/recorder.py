@@ -19,6 +19,8 @@ from proto.membership import membership
 from proto.messages import Rollout
 from proto.metrics import RecorderMetrics
 from proto.recordings.episodes import write_episode
+from proto.recordings.schemas import SceneUpdate
+from services.robot_meshes import robot_meshes
 
 LOG = logging.getLogger(__name__)
 
@@ -36,6 +38,7 @@ class Recorder:
         self._bus = bus
         self._lifecycle = lifecycle
         self._inbox: Inbox[Rollout] = bus.inbox(bus.keys.rollout(), Rollout, capacity=WAITING)
+        self._robot = _robot()
         self._episodes = 0
         self._bytes = 0
         self._failed = 0
@@ -71,10 +74,19 @@ class Recorder:
         if path.exists():  # the actor sent it again because its receipt was late
             return
         try:
-            write_episode(path, episode)
+            write_episode(path, episode, robot=self._robot)
         except UserError as error:  # such as a full disk, on which space may be freed later
             self._failed += 1
             LOG.warning("rollout %s is not recorded: %s", episode.id, error)
             return
         self._episodes += 1
         self._bytes += path.stat().st_size
+
+
+def _robot() -> SceneUpdate | None:
+    """The robot's meshes; None, with a warning, if this machine cannot build them."""
+    try:
+        return robot_meshes()
+    except UserError as error:
+        LOG.warning("viewers will not show the robot in the recordings: %s", error)
+        return None

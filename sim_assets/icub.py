@@ -118,6 +118,7 @@ class IcubModel:
         joints: names of the joints that move: neck, arm, then phalanges.
         seen_by_eye: what the left eye can see of the robot, in simplified meshes.
         seen_from_outside: the whole robot in full detail.
+        seen_in_recordings: the whole robot with few triangles.
     """
 
     urdf: Path
@@ -125,6 +126,7 @@ class IcubModel:
     joints: tuple[str, ...]
     seen_by_eye: tuple[Visual, ...]
     seen_from_outside: tuple[Visual, ...]
+    seen_in_recordings: tuple[Visual, ...]
 
 
 def build_icub(cache: Path) -> IcubModel:
@@ -148,6 +150,7 @@ def build_icub(cache: Path) -> IcubModel:
         joints=(*JOINT_LIMITS_DEG, *(phalanx.joint for phalanx in hand.PHALANGES)),
         seen_by_eye=icub_visuals.read_visuals(folder, "eye"),
         seen_from_outside=icub_visuals.read_visuals(folder, "outside"),
+        seen_in_recordings=icub_visuals.read_visuals(folder, "recorded"),
     )
 
 

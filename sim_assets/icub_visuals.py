@@ -1,7 +1,8 @@
 """The robot's visible shapes: the official meshes, and a hand of our own.
 
-Two sets are made. The *eye* set holds what the left eye can see of the robot, simplified because it
-is drawn in every control step. The *outside* set holds the whole robot in full detail.
+Three sets are made. The *eye* set holds what the left eye can see of the robot, simplified because
+it is drawn in every control step. The *outside* set holds the whole robot in full detail. The
+*recorded* set holds the whole robot with few triangles, because every recording contains it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from sim_assets import hand
 from sim_assets.urdf import Matrix, Tree, Vector, find, numbers, origin_pose
 
 Colour = tuple[float, float, float]
-SetName = Literal["eye", "outside"]
+SetName = Literal["eye", "outside", "recorded"]
 
 MANIFEST: Final = "visuals.json"
 
@@ -40,6 +41,8 @@ EYE_FACES: Final = 800
 """Triangles of each official mesh in the eye set, at most."""
 EYE_HAND_FACES: Final = 80
 """Triangles of each part of our hand in the eye set, at most."""
+RECORDED_FACES: Final = 60
+"""Triangles of each mesh in the recorded set, at most."""
 CREASE_DEG: Final = 35.0
 """Edges with a larger angle between their faces stay sharp; all others are shaded smoothly."""
 
@@ -101,7 +104,7 @@ class _Part:
 
 
 def write_visuals(folder: Path, source: Tree, meshes: Path, links: Iterable[str]) -> None:
-    """Write both sets, and a file that lists them, into a folder.
+    """Write all sets, and a file that lists them, into a folder.
 
     Args:
         folder: where to write; it exists.
@@ -117,6 +120,7 @@ def write_visuals(folder: Path, source: Tree, meshes: Path, links: Iterable[str]
     sets: dict[SetName, list[_Part]] = {
         "eye": seen + [_simplified(part, EYE_HAND_FACES) for part in hand_parts],
         "outside": official + unmoved + hand_parts,
+        "recorded": [_simplified(part, RECORDED_FACES) for part in official + unmoved + hand_parts],
     }
     listing = {name: _write_set(folder / name, parts) for name, parts in sets.items()}
     (folder / MANIFEST).write_text(json.dumps(listing, indent=1))

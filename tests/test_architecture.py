@@ -26,6 +26,7 @@ ONLY_IN = {
 """Packages that may be imported in one place only."""
 
 MAY_WRITE = {
+    "services/playing/video_file.py": "a video in a temporary folder, which storage then copies",
     "proto/storage.py": "all writing goes through it",
     "proto/run_locks.py": "an empty file that is locked; nothing is kept in it",
     "sim_assets/icub_visuals.py": "a cache, built in a folder that is renamed when it is complete",

@@ -55,8 +55,9 @@ class NeighbourGrid:
     A dimension of the grid is a continuous value of the situation. Two situations are neighbours if
     they differ in one continuous value only and no other situation lies between them. A value that
     is text is a discrete choice: sequences are mixed only if their discrete values agree, and their
-    lengths. A situation without neighbours is never mixed. Distractors, on which the actions do not
-    depend, count for nothing here: situations that differ in them alone lie at the same point.
+    lengths. A situation without neighbours is never mixed, nor is one that is not known (empty).
+    Distractors, on which the actions do not depend, count for nothing here: situations that differ
+    in them alone lie at the same point.
     """
 
     def __init__(
@@ -79,6 +80,9 @@ class NeighbourGrid:
         self._points = [
             _point(situation, length) for situation, length in zip(relevant, steps, strict=True)
         ]
+        for index, situation in enumerate(situations):
+            if not situation:  # not known: nothing can be said about its neighbours
+                self._points[index] = _Point((), (index,))
         self._sequences_at: dict[_Point, list[int]] = defaultdict(list)
         for index, point in enumerate(self._points):
             self._sequences_at[point].append(index)

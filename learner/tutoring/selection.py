@@ -99,5 +99,14 @@ class Intake:
             if variable not in episode.situation:
                 raise UserError(
                     f"{episode.id} has no {variable!r} in its situation, which pre-training asks"
-                    f" for; it has {', '.join(sorted(episode.situation))}"
+                    f" for; {_what_is_known(episode)}"
                 )
+
+
+def _what_is_known(episode: Episode) -> str:
+    if episode.situation:
+        return f"it has {', '.join(sorted(episode.situation))}"
+    return (
+        "its situation is not known. Set learner.pretraining.epochs=0, or pre-train on other"
+        " sequences (--pretraining-data)"
+    )

@@ -1,15 +1,19 @@
 """Writes and reads episodes: one lossless MCAP file each, which Foxglove can open.
 
+Each step t has messages on these topics. Its log time is started_s + t * control_period_s.
+
 | topic | schema | content |
 |---|---|---|
 | `/eye` | foxglove.CompressedImage | images[t] as PNG |
-| `/joints` | foxglove.JointStates | joints_deg[t], in radians, the unit of the schema |
-| `/tf` | foxglove.FrameTransforms | body_poses[t], each body a frame in `world` |
+| `/eye/calibration` | foxglove.CameraCalibration | view.focal_px[t] |
+| `/joints` | foxglove.JointStates | joints_deg[t] and velocities, in radians, the schema's unit |
+| `/tf` | foxglove.FrameTransforms | body_poses[t], bodies in `world`; then fixed frames |
 | `/states` | vmdnn.States | states[t] of each subnet; only if the episode has states |
 | `/step` | vmdnn.Step | phases[t], actions[t], targets[t], outputs[t]; ends step t |
 
-Step t has the log time t * control_period_s. All other fields are in four metadata records before
-the first message: `episode`, `situation`, `outcome` and `measures`.
+What only viewers need comes once (see `proto.recordings.viewing`): `/boxes`, `/robot`, `/events`.
+All other fields are in metadata records before the first message: `episode`, `situation`,
+`outcome`, `measures` and, if the episode has a view, `boxes` and `fixed_links`.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,32 +38,45 @@ from numpy.typing import NDArray
 from zstandard import ZstdError
 
 from proto.body import ACTION_NAMES, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
-from proto.episode import Episode, Floats, Image, Kind, Measure, Outcome
+from proto.episode import BoxLook, Episode, Floats, Image, Kind, Measure, Outcome, View
 from proto.errors import UserError
-from proto.recordings import format1
+from proto.recordings import format1, viewing
 from proto.recordings.schemas import (
+    ACTION_FIELDS,
+    CameraCalibration,
     CompressedImage,
     FrameTransforms,
     JointStates,
+    Log,
     Message,
+    SceneUpdate,
     States,
     Step,
     describe,
 )
 from proto.storage import written_whole
 
-FORMAT: Final = 2
-"""Format of the files that are written; files of format 1 can be read too."""
+FORMAT: Final = 3
+"""Format of the files that are written; files of formats 1 and 2 can be read too."""
 EYE: Final = "/eye"
+CALIBRATION: Final = "/eye/calibration"
 JOINTS: Final = "/joints"
 TRANSFORMS: Final = "/tf"
 STATES: Final = "/states"
 STEP: Final = "/step"
-TOPICS: Final[Mapping[str, type[Message]]] = {
+BOXES: Final = "/boxes"
+ROBOT: Final = "/robot"
+EVENTS: Final = "/events"
+_SCHEMAS: Final[Mapping[str, type[Message]]] = {
     EYE: CompressedImage,
+    CALIBRATION: CameraCalibration,
     JOINTS: JointStates,
     TRANSFORMS: FrameTransforms,
+    STATES: States,
     STEP: Step,
+    BOXES: SceneUpdate,
+    ROBOT: SceneUpdate,
+    EVENTS: Log,
 }
 
 _READINGS: Final = ("lenient", "strict", "precise")
@@ -78,8 +95,23 @@ DAMAGE: Final = (
 """Exceptions raised by reading the records of a truncated or damaged file."""
 
 
-def write_episode(path: Path, episode: Episode) -> None:
+class _Told(NamedTuple):
+    """A message to be written: its topic, step, log time (ns) and serialized content."""
+
+    topic: str
+    step: int
+    time_ns: int
+    data: bytes
+
+
+def write_episode(path: Path, episode: Episode, *, robot: SceneUpdate | None = None) -> None:
     """Write an episode; the file appears under its name only when it is complete.
+
+    Args:
+        path: the file.
+        episode: the episode.
+        robot: the robot's meshes in the frames of its links, so that viewers show it; None leaves
+            them out. `services.robot_meshes` has them.
 
     Raises:
         UserError: the file cannot be written.
@@ -87,17 +119,14 @@ def write_episode(path: Path, episode: Episode) -> None:
     with written_whole(path) as stream:
         writer = Writer(stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         writer.start(profile="vmdnn", library="vmdnn")
-        writer.add_metadata("episode", _episode_texts(episode))
-        writer.add_metadata("situation", {k: json.dumps(v) for k, v in episode.situation.items()})
-        writer.add_metadata("outcome", _outcome_texts(episode.outcome))
-        writer.add_metadata("measures", _measure_texts(episode.outcome))
-        topics = dict(TOPICS) if episode.states is None else {**TOPICS, STATES: States}
-        channels = {topic: _register(writer, topic, schema) for topic, schema in topics.items()}
-        for step in range(episode.steps):
-            time_ns = round(step * episode.control_period_s * 1e9)
-            for topic, message in _messages(episode, step, time_ns):
-                data = message.SerializeToString()
-                writer.add_message(channels[topic], time_ns, data, time_ns, sequence=step)
+        for name, texts in _metadata(episode):
+            writer.add_metadata(name, texts)
+        channels: dict[str, int] = {}
+        for told in _messages(episode, robot):
+            if told.topic not in channels:
+                channels[told.topic] = _register(writer, told.topic)
+            channel = channels[told.topic]
+            writer.add_message(channel, told.time_ns, told.data, told.time_ns, sequence=told.step)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
@@ -216,41 +245,96 @@ def _contents(path: Path) -> _Contents:
     return contents
 
 
-def _register(writer: Writer, topic: str, schema: type[Message]) -> int:
+def _register(writer: Writer, topic: str) -> int:
+    schema = _SCHEMAS[topic]
     name = schema.DESCRIPTOR.full_name
     schema_id = writer.register_schema(name, "protobuf", describe(schema))
     return writer.register_channel(topic, "protobuf", schema_id)
 
 
-def _messages(episode: Episode, step: int, time_ns: int) -> Iterator[tuple[str, Message]]:
-    eye = CompressedImage(format="png", frame_id="left_eye", data=_png(episode.images[step]))
-    joints = JointStates()
-    for name, angle in zip(JOINT_NAMES, _radians(episode.joints_deg[step]), strict=True):
-        joints.joints.add(name=name, position=angle)
-    transforms = FrameTransforms()
-    for name, pose in zip(episode.body_names, episode.body_poses[step].tolist(), strict=True):
-        transform = transforms.transforms.add(parent_frame_id="world", child_frame_id=name)
-        transform.timestamp.FromNanoseconds(time_ns)
-        position, rotation = transform.translation, transform.rotation
-        position.x, position.y, position.z = pose[:3]
-        rotation.w, rotation.x, rotation.y, rotation.z = pose[3:]
-    step_message = Step(
+def _messages(episode: Episode, robot: SceneUpdate | None) -> Iterator[_Told]:
+    """All messages of an episode, in the order of their times."""
+    start_ns = round((episode.started_s or 0.0) * 1e9)
+    if robot is not None:
+        yield _Told(ROBOT, 0, start_ns, robot.SerializeToString())
+    if episode.view is not None:
+        boxes = viewing.boxes(episode.view, start_ns)
+        yield _Told(BOXES, 0, start_ns, boxes.SerializeToString())
+    steps = _StepMessages(episode, start_ns)
+    for step in range(episode.steps):
+        time_ns = start_ns + round(step * episode.control_period_s * 1e9)
+        if step == 0 or episode.phases[step] != episode.phases[step - 1]:
+            begun = viewing.phase_event(episode, step, time_ns)
+            yield _Told(EVENTS, step, time_ns, begun.SerializeToString())
+        for topic, data in steps.of(step, time_ns):
+            yield _Told(topic, step, time_ns, data)
+    end_ns = start_ns + round(episode.steps * episode.control_period_s * 1e9)
+    ended = viewing.outcome_event(episode.outcome, end_ns)
+    yield _Told(EVENTS, episode.steps, end_ns, ended.SerializeToString())
+
+
+class _StepMessages:
+    """Makes the messages of one step after the other; what stays the same is made only once."""
+
+    def __init__(self, episode: Episode, start_ns: int) -> None:
+        self._episode = episode
+        self._joints_rad = np.radians(episode.joints_deg.astype(np.float64))
+        self._velocities_rad_s = viewing.velocities(self._joints_rad, episode.control_period_s)
+        self._joints = JointStates()
+        for name in JOINT_NAMES:
+            self._joints.joints.add(name=name)
+        self._transforms = FrameTransforms()
+        for name in episode.body_names:
+            self._transforms.transforms.add(parent_frame_id=viewing.WORLD, child_frame_id=name)
+        # Repeated fields that are serialized one after the other are one list when they are read.
+        fixed = viewing.fixed_transforms(episode.view, start_ns)
+        self._fixed_transforms = bytes(fixed.SerializeToString())
+
+    def of(self, step: int, time_ns: int) -> Iterator[tuple[str, bytes]]:
+        """Topic and content of each message of a step."""
+        episode = self._episode
+        eye = CompressedImage(
+            format="png", frame_id=viewing.CAMERA_FRAME, data=_png(episode.images[step])
+        )
+        viewing.set_time(eye.timestamp, time_ns)
+        yield EYE, eye.SerializeToString()
+        if episode.view is not None:
+            focal_px = episode.view.focal_px[step].tolist()
+            yield CALIBRATION, viewing.calibration(focal_px, time_ns).SerializeToString()
+        yield JOINTS, self._joints_of(step, time_ns)
+        yield TRANSFORMS, self._transforms_of(step, time_ns)
+        if episode.states is not None:
+            states = States()
+            for name, activity in episode.states.items():
+                states.subnets.add(name=name, activity=activity[step].tolist())
+            yield STATES, states.SerializeToString()
+        yield STEP, _step(episode, step).SerializeToString()
+
+    def _joints_of(self, step: int, time_ns: int) -> bytes:
+        viewing.set_time(self._joints.timestamp, time_ns)
+        angles = self._joints_rad[step].tolist()
+        velocities = self._velocities_rad_s[step].tolist()
+        for joint, angle, velocity in zip(self._joints.joints, angles, velocities, strict=True):
+            joint.position, joint.velocity = angle, velocity
+        return bytes(self._joints.SerializeToString())
+
+    def _transforms_of(self, step: int, time_ns: int) -> bytes:
+        poses = self._episode.body_poses[step].tolist()
+        for transform, pose in zip(self._transforms.transforms, poses, strict=True):
+            viewing.set_time(transform.timestamp, time_ns)
+            viewing.set_pose(transform, pose)
+        return bytes(self._transforms.SerializeToString()) + self._fixed_transforms
+
+
+def _step(episode: Episode, step: int) -> Message:
+    return Step(
         step=step,
         phase=int(episode.phases[step]) + 1,
         phase_name=episode.phase_names[episode.phases[step]],
-        action=dict(zip(ACTION_NAMES, episode.actions[step].tolist(), strict=True)),
-        target=dict(zip(ACTION_NAMES, episode.targets[step].tolist(), strict=True)),
+        action=dict(zip(ACTION_FIELDS, episode.actions[step].tolist(), strict=True)),
+        target=dict(zip(ACTION_FIELDS, episode.targets[step].tolist(), strict=True)),
         outputs=[] if episode.outputs is None else episode.outputs[step].tolist(),
     )
-    eye.timestamp.FromNanoseconds(time_ns)
-    joints.timestamp.FromNanoseconds(time_ns)
-    yield from ((EYE, eye), (JOINTS, joints), (TRANSFORMS, transforms))
-    if episode.states is not None:
-        states = States()
-        for name, activity in episode.states.items():
-            states.subnets.add(name=name, activity=activity[step].tolist())
-        yield STATES, states
-    yield STEP, step_message
 
 
 def _episode(contents: _Contents) -> Episode:
@@ -286,7 +370,21 @@ def _episode(contents: _Contents) -> Episode:
         control_period_s=float(texts["control_period_s"]),
         states=_states(contents.messages[STATES][:count], json.loads(texts.get("states", "null"))),
         training=texts.get("training", ""),  # older recordings do not have this field
+        started_s=_started_s(texts),
+        view=_view(contents, count),
     )
+
+
+def _metadata(episode: Episode) -> Iterator[tuple[str, dict[str, str]]]:
+    """Name and texts of each metadata record."""
+    yield "episode", _episode_texts(episode)
+    yield "situation", {k: json.dumps(v) for k, v in episode.situation.items()}
+    yield "outcome", _outcome_texts(episode.outcome)
+    yield "measures", _measure_texts(episode.outcome)
+    if episode.view is not None:
+        yield "boxes", {k: json.dumps([v.size_m, v.colour]) for k, v in episode.view.boxes.items()}
+        fixed = episode.view.fixed_links.items()
+        yield "fixed_links", {name: json.dumps(pose.tolist()) for name, pose in fixed}
 
 
 def _episode_texts(episode: Episode) -> dict[str, str]:
@@ -306,6 +404,7 @@ def _episode_texts(episode: Episode) -> dict[str, str]:
         "steps": str(episode.steps),
         "phase_names": json.dumps(episode.phase_names),
         **_states_text(episode),
+        **({} if episode.started_s is None else {"started_s": repr(episode.started_s)}),
         "outputs": json.dumps(None if episode.outputs is None else episode.outputs.shape[1]),
         "body_names": json.dumps(episode.body_names),
     }
@@ -317,6 +416,32 @@ def _states_text(episode: Episode) -> dict[str, str]:
         return {}
     units = {name: activity.shape[1] for name, activity in episode.states.items()}
     return {"states": json.dumps(units)}
+
+
+def _started_s(texts: Mapping[str, str]) -> float | None:
+    return float(texts["started_s"]) if "started_s" in texts else None
+
+
+def _view(contents: _Contents, steps: int) -> View | None:
+    """The view of an episode; None if it has none, as in files of formats 1 and 2."""
+    if "fixed_links" not in contents.metadata:
+        return None
+    boxes = {name: json.loads(text) for name, text in contents.metadata["boxes"].items()}
+    fixed = contents.metadata["fixed_links"].items()
+    focal = []
+    for data in contents.messages[CALIBRATION][:steps]:
+        camera = CameraCalibration.FromString(data).K
+        focal.append((camera[0], camera[4]))
+    return View(
+        boxes={name: BoxLook(_axes(size), _axes(colour)) for name, (size, colour) in boxes.items()},
+        fixed_links={name: _floats(json.loads(text), (7,)) for name, text in fixed},
+        focal_px=_floats(focal, (steps, 2)),
+    )
+
+
+def _axes(values: Sequence[Any]) -> tuple[float, float, float]:
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 def _outcome_texts(outcome: Outcome) -> dict[str, str]:
@@ -395,27 +520,22 @@ def _states(messages: Sequence[bytes], units: Mapping[str, int] | None) -> dict[
     return {name: _floats(rows[name], (len(messages), size)) for name, size in units.items()}
 
 
-def _radians(joints_deg: Floats) -> list[float]:
-    # In float64, so that converting back to degrees and rounding to float32 is exact.
-    radians: list[float] = np.radians(joints_deg.astype(np.float64)).tolist()
-    return radians
-
-
 def _joints_deg(messages: Sequence[bytes]) -> Floats:
     radians = [
         [joint.position for joint in JointStates.FromString(data).joints] for data in messages
     ]
+    # In float64, so that converting to degrees and rounding to float32 is exact.
     return np.degrees(_array(radians, (len(messages), len(JOINT_NAMES)))).astype(np.float32)
 
 
 def _action(action: Any) -> list[float]:
-    return [getattr(action, name) for name in ACTION_NAMES]
+    return [getattr(action, name) for name in ACTION_FIELDS]
 
 
 def _poses(messages: Sequence[bytes], bodies: int) -> Floats:
     poses = []
     for data in messages:
-        for transform in FrameTransforms.FromString(data).transforms:
+        for transform in FrameTransforms.FromString(data).transforms[:bodies]:
             position, rotation = transform.translation, transform.rotation
             poses.append(
                 (
@@ -426,9 +546,9 @@ def _poses(messages: Sequence[bytes], bodies: int) -> Floats:
     return _floats(poses, (len(messages), bodies, 7))
 
 
-def _floats(rows: Sequence[Sequence[float]], shape: tuple[int, ...]) -> Floats:
+def _floats(rows: Sequence[Any], shape: tuple[int, ...]) -> Floats:
     return _array(rows, shape).astype(np.float32)
 
 
-def _array(rows: Sequence[Sequence[float]], shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _array(rows: Sequence[Any], shape: tuple[int, ...]) -> NDArray[np.float64]:
     return np.array(rows, dtype=np.float64).reshape(shape)

@@ -1,12 +1,18 @@
-"""Protobuf schemas of a recording: Foxglove's schemas, and `Step` and `States` defined here."""
+"""Protobuf schemas of a recording: Foxglove's schemas, and `Step` and `States` defined here.
+
+A file is read by the numbers of the fields, so that their names may change.
+"""
 
 from __future__ import annotations
 
 from typing import Final
 
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf import message_factory
 from google.protobuf.descriptor import FileDescriptor
 from google.protobuf.descriptor_pb2 import (
@@ -18,17 +24,26 @@ from google.protobuf.descriptor_pb2 import (
 from google.protobuf.descriptor_pool import Default
 from google.protobuf.message import Message
 
-from proto.body import ACTION_NAMES
+from proto.body import ACTION_NAMES, FOCUS, GRASP
 
 __all__ = [
+    "ACTION_FIELDS",
+    "CameraCalibration",
     "CompressedImage",
     "FrameTransforms",
     "JointStates",
+    "Log",
     "Message",
+    "SceneUpdate",
     "States",
     "Step",
     "describe",
 ]
+
+ACTION_FIELDS: Final = tuple(
+    name if number in (GRASP, FOCUS) else f"{name}_deg" for number, name in enumerate(ACTION_NAMES)
+)
+"""Fields of an action, in its order; the name of an angle ends with its unit."""
 
 
 def _field(number: int, name: str, kind: int, message: str | None = None) -> FieldDescriptorProto:
@@ -47,7 +62,7 @@ def _step_file() -> FileDescriptorProto:
         name="Action",
         field=[
             _field(number, name, FieldDescriptorProto.TYPE_FLOAT)
-            for number, name in enumerate(ACTION_NAMES, 1)
+            for number, name in enumerate(ACTION_FIELDS, 1)
         ],
     )
     outputs = _field(5, "outputs", FieldDescriptorProto.TYPE_FLOAT)

@@ -19,6 +19,7 @@ from proto.storage import written_whole
 from proto.variables import parse_situation
 from services.arguments.common import add_config, add_playing, playing_config, positive, seed
 from services.playing.video import write_video
+from services.playing.video_file import video_argument
 from services.playing.workers import Job, play_all
 from services.terminal.progress import progress_bar
 from services.terminal.tables import success_table
@@ -59,7 +60,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="record the activity of the network's subnets in the rollouts; a megabyte each",
     )
-    parser.add_argument("--video", type=Path, help="MP4 file for a video of the first trial")
+    parser.add_argument(
+        "--video", type=video_argument, help="file for a video of the first trial, .mp4 or .gif"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

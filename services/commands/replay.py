@@ -9,13 +9,16 @@ from proto.config import SimulatorConfig
 from proto.recordings.episodes import read_episode
 from services.arguments.common import add_config, config_of
 from services.playing.video import write_video
+from services.playing.video_file import video_argument
 from services.terminal.progress import progress_bar
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
     parser.add_argument("file", type=Path, help="recorded episode, whole or recovered")
-    parser.add_argument("--out", type=Path, required=True, help="MP4 file to write")
+    parser.add_argument(
+        "--out", type=video_argument, required=True, help="file to write, .mp4 or .gif"
+    )
     parser.add_argument("--fps", type=float, help="steps per second; without it, real time")
     parser.add_argument(
         "--backend", help="simulator that renders; without it, the one that played the episode"

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from pathlib import Path
 from textwrap import wrap
 from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from actors.attention import crop_of_focus
 from actors.simulator import EYE_HEIGHT, EYE_WIDTH, Crop, Pose, Simulator, make_simulator
@@ -22,15 +19,11 @@ from proto.body import FOCUS
 from proto.config import Config
 from proto.episode import NO_FAILURE, Episode, Outcome
 from proto.errors import UserError
-from proto.storage import written_whole
 from proto.variables import situation_text
-
-Picture = NDArray[np.uint8]
+from services.playing.video_file import Picture, check_video_name, video_file
 
 PANEL_WIDTH: Final = 640
 PANEL_HEIGHT: Final = 480
-VIDEO_WIDTH: Final = 2 * PANEL_WIDTH
-VIDEO_HEIGHT: Final = PANEL_HEIGHT
 _LINE: Final = 24
 _LINE_LETTERS: Final = 78
 """So many letters of the caption fit beside each other."""
@@ -46,25 +39,29 @@ def write_video(
     fps: float | None = None,
     on_frame: Callable[[], None] = lambda: None,
 ) -> None:
-    """Render every step of a recorded episode into an MP4 file.
+    """Render every step of a recorded episode into a video.
 
     Nothing is simulated: the simulator shows the recorded joints and bodies of each step.
 
     Args:
         episode: the recorded episode.
-        out: the file to write; it appears under its name only when it is complete.
+        out: the file to write, .mp4 (H.264) or .gif; it appears under its name only when it is
+            complete.
         config: the simulator that renders, and options of the task.
         fps: frames per second, one frame for each control step; None for real time.
         on_frame: called after each frame.
 
     Raises:
-        UserError: the simulator cannot render, the scene needs an option of the task, or the file
-            cannot be written.
+        UserError: the name of the file has another ending, the simulator cannot render, the scene
+            needs an option of the task, or the file cannot be written.
     """
+    check_video_name(out)
+    if not episode.situation:
+        raise UserError(f"the situation of {episode.id} is not known, so there is no scene to show")
     rate = fps or 1.0 / episode.control_period_s
     with (
         closing(make_simulator(config.simulator.model_copy(update={"render": True}))) as simulator,
-        _video_file(out, rate) as write,
+        video_file(out, rate) as write,
     ):
         for frame in frames(episode, simulator, make_task(config.task_called(episode.task))):
             write(frame)
@@ -145,30 +142,3 @@ def _write_lines(picture: Picture, lines: Sequence[str]) -> None:
     for number, line in enumerate(lines, 1):
         place = (_MARGIN, number * _LINE)
         cv2.putText(picture, line, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _WHITE, 1, cv2.LINE_AA)
-
-
-@contextmanager
-def _video_file(out: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
-    """Open a video file to write pictures to.
-
-    The video is encoded in a temporary folder and copied to `out` when it is complete.
-    """
-    if out.suffix != ".mp4":
-        raise UserError(f"{out}: the video's name must end in .mp4")
-    with tempfile.TemporaryDirectory() as folder:
-        encoded = Path(folder) / "video.mp4"
-        size = (VIDEO_WIDTH, VIDEO_HEIGHT)
-        writer = cv2.VideoWriter(str(encoded), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
-        if not writer.isOpened():
-            raise UserError("OpenCV cannot encode MP4 here; install opencv-python-headless")
-
-        def write(picture: Picture) -> None:
-            if not writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)):
-                raise UserError(f"{out}: the video could not be written; is the disk full?")
-
-        try:
-            yield write
-        finally:
-            writer.release()
-        with encoded.open("rb") as source, written_whole(out) as target:
-            shutil.copyfileobj(source, target)

@@ -28,6 +28,7 @@ from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.recordings.episodes import write_episode
 from proto.variables import Situation
+from services.robot_meshes import robot_meshes
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ class _Player:
         if stateful is not None:
             episode = replace(episode, states=stateful.states(episode.images))
         if job.record_to is not None:
-            write_episode(job.record_to, episode)
+            write_episode(job.record_to, episode, robot=robot_meshes())
         return episode
 
     def _policy_for(self, job: Job) -> Policy:

@@ -251,10 +251,10 @@ def test_an_unchecked_invalid_message_is_refused_by_the_receiver(sequence: Seque
 
 def test_another_message_or_version_is_refused(sequence: Sequence) -> None:
     wire = encode(sequence)
-    assert wire.encoding == "application/msgpack;vmdnn.sequence.3"
+    assert wire.encoding == "application/msgpack;vmdnn.sequence.4"
     for encoding in (
-        "application/msgpack;vmdnn.sequence.2",
-        "application/msgpack;vmdnn.rollout.2",
+        "application/msgpack;vmdnn.sequence.3",
+        "application/msgpack;vmdnn.rollout.3",
         "zenoh/bytes",
         "",
     ):

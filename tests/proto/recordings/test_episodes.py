@@ -18,12 +18,13 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
-from proto.episode import NO_FAILURE, Episode, Kind, Measure, Outcome
+from proto.episode import NO_FAILURE, BoxLook, Episode, Kind, Measure, Outcome, View
 from proto.errors import UserError
 from proto.recordings.episodes import EpisodeSummary, read_episode, read_summary, write_episode
 from sim_assets.hand import MOTOR_NAMES
 
 OUTPUTS = 110
+STARTED_S = 1_700_000_000.25
 FORMAT_1 = Path(__file__).parents[2] / "data" / "format1"
 
 
@@ -42,6 +43,17 @@ def outcomes(draw: st.DrawFn) -> Outcome:
     measure = st.builds(Measure, st.floats(), st.text(max_size=4))
     return Outcome(
         *readings, reason, draw(st.dictionaries(st.text(max_size=8), measure, max_size=4))
+    )
+
+
+@st.composite
+def views(draw: st.DrawFn, steps: int) -> View:
+    word = st.text(max_size=8)
+    axes = st.tuples(*[st.floats(0.0, 9.0)] * 3)
+    return View(
+        boxes=draw(st.dictionaries(word, st.builds(BoxLook, axes, axes), max_size=2)),
+        fixed_links=draw(st.dictionaries(word, floats(7), max_size=2)),
+        focal_px=draw(floats(steps, 2)),
     )
 
 
@@ -75,6 +87,8 @@ def episodes(draw: st.DrawFn) -> Episode:
         control_period_s=draw(st.floats(0.001, 10.0)),
         states=draw(st.none() | st.dictionaries(word, floats(steps, 7), max_size=3)),
         training=draw(word),
+        started_s=draw(st.none() | st.floats(0.0, 1e10)),
+        view=draw(st.none() | views(steps)),
     )
 
 
@@ -86,7 +100,7 @@ def same(one: object, other: object) -> bool:
         )
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
-    if isinstance(one, Outcome) and isinstance(other, Outcome):
+    if isinstance(one, Outcome | View) and isinstance(other, Outcome | View):
         return same(vars(one), vars(other))
     return type(one) is type(other) and repr(one) == repr(other)
 
@@ -126,7 +140,13 @@ def test_joint_names_agree_with_the_hand() -> None:
 
 def test_another_mcap_reader_can_read_it(tmp_path: Path, make_episode: MakeEpisode) -> None:
     """With nothing but the file: index, schemas, times and metadata, as Foxglove reads them."""
-    path, episode = tmp_path / "episode.mcap", make_episode()
+    view = View(
+        boxes={"object": BoxLook((0.028, 0.1, 0.07), (0.8, 0.1, 0.1))},
+        fixed_links={"root_link": np.array([0, 0, 0.15, 0.5**0.5, 0, 0, -(0.5**0.5)], np.float32)},
+        focal_px=np.full((40, 2), 51.5, dtype=np.float32),
+    )
+    path = tmp_path / "episode.mcap"
+    episode = make_episode(started_s=STARTED_S, view=view)
     write_episode(path, episode)
     seen: dict[str, list[Message]] = {}
     with path.open("rb") as stream:
@@ -135,22 +155,47 @@ def test_another_mcap_reader_can_read_it(tmp_path: Path, make_episode: MakeEpiso
             assert schema is not None
             files = FileDescriptorSet.FromString(schema.data).file
             decoder = message_factory.GetMessages(list(files))[schema.name]
-            step = len(seen.setdefault(channel.topic, []))
-            assert message.log_time == round(step * episode.control_period_s * 1e9)
-            seen[channel.topic].append(decoder.FromString(message.data))
+            step = message.sequence
+            start_ns = round(STARTED_S * 1e9)
+            assert message.log_time == start_ns + round(step * episode.control_period_s * 1e9)
+            seen.setdefault(channel.topic, []).append(decoder.FromString(message.data))
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
     assert {topic: messages[0].DESCRIPTOR.full_name for topic, messages in seen.items()} == {
+        "/boxes": "foxglove.SceneUpdate",
+        "/events": "foxglove.Log",
         "/eye": "foxglove.CompressedImage",
+        "/eye/calibration": "foxglove.CameraCalibration",
         "/joints": "foxglove.JointStates",
         "/tf": "foxglove.FrameTransforms",
         "/step": "vmdnn.Step",
     }
-    assert all(len(messages) == episode.steps for messages in seen.values())
+    counts = {topic: len(messages) for topic, messages in seen.items()}
+    assert counts.pop("/boxes") == 1
+    assert counts.pop("/events") == len(episode.phase_names) + 1
+    assert set(counts.values()) == {episode.steps}
     last_joints, last_step = seen["/joints"][-1], seen["/step"][-1]
     assert [joint.name for joint in last_joints.joints] == list(JOINT_NAMES)
     assert last_joints.joints[5].position == pytest.approx(np.radians(episode.joints_deg[-1, 5]))
-    assert last_step.action.r_elbow == episode.actions[-1, 5]
-    assert [frame.child_frame_id for frame in seen["/tf"][0].transforms] == ["object", "obstacle"]
+    moved = np.radians(np.diff(episode.joints_deg[-2:, 5].astype(float))).item()
+    velocity = moved / episode.control_period_s
+    assert last_joints.joints[5].velocity == pytest.approx(velocity, rel=1e-5)
+    assert last_step.action.r_elbow_deg == episode.actions[-1, 5]
+    assert last_step.action.focus_level == episode.actions[-1, 10]
+    frames = [(frame.parent_frame_id, frame.child_frame_id) for frame in seen["/tf"][7].transforms]
+    assert frames == [
+        ("world", "object"),
+        ("world", "obstacle"),
+        ("world", "root_link"),
+        ("l_eye", "l_eye_optical"),
+    ]
+    assert seen["/eye"][0].frame_id == seen["/eye/calibration"][0].frame_id == "l_eye_optical"
+    (box,) = seen["/boxes"][0].entities
+    assert (box.frame_id, box.frame_locked, box.cubes[0].size.y) == ("object", True, 0.1)
+    outcome = seen["/events"][-1]
+    assert outcome.name == "outcome"
+    assert outcome.message.startswith("lenient, strict; reason imprecise; ")
+    assert "yaw_error_deg 11 deg" in outcome.message
+    assert [event.message for event in seen["/events"][:2]] == list(episode.phase_names[:2])
     assert (last_step.phase, last_step.phase_name) == (8, "lift")
     assert metadata["outcome"]["reason"] == "imprecise"
     assert metadata["measures"]["yaw_error_deg"] == '[11.0, "deg"]'
@@ -248,9 +293,9 @@ def test_a_file_of_a_newer_format_is_refused(
 ) -> None:
     path = tmp_path / "episode.mcap"
     with monkeypatch.context() as later:
-        later.setattr("proto.recordings.episodes.FORMAT", 3)
+        later.setattr("proto.recordings.episodes.FORMAT", 4)
         write_episode(path, make_episode(3))
-    with pytest.raises(UserError, match=r"of format 3, written by a newer vmdnn.*update vmdnn"):
+    with pytest.raises(UserError, match=r"of format 4, written by a newer vmdnn.*update vmdnn"):
         read_episode(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -134,7 +135,8 @@ def test_an_intact_file_is_left_alone(
     path.write_bytes(recording)
     before = path.stat()
     assert main(["recover", str(path)]) == 0
-    assert f"is whole ({4 * STEPS} messages, {STEPS} of {STEPS} steps)" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert re.search(rf"is whole \(\d+ messages, {STEPS} of {STEPS} steps\)", told)
     assert path.stat().st_mtime_ns == before.st_mtime_ns
     assert main(["recover", str(path), "--out", str(copy)]) == 0
     assert read_episode(copy).id == read_episode(path).id

@@ -62,6 +62,11 @@ def test_the_video_shows_both_views_of_every_step(short: Path, tmp_path: Path) -
         assert (moved > 50).any(axis=2)[:, 640:].sum() > 500
 
 
+def test_recordings_are_exported_as_videos(short: Path, tmp_path: Path) -> None:
+    assert main(["export", str(short.parent), "--format", "video", "--out", str(tmp_path)]) == 0
+    assert len(read_video(tmp_path / f"{read_episode(short).id}.mp4")[0]) == len(STEPS)
+
+
 def test_the_recorded_picture_agrees_with_the_rendered_view(short: Path, tmp_path: Path) -> None:
     """The inset is what the network was given; the frame says where it lies in the eye's view."""
     out = tmp_path / "episode.mp4"
@@ -149,22 +154,26 @@ def test_gestures_of_ones_own_are_replayed_on_the_screen(
     assert eye[240, 320] == pytest.approx((200, 200, 200), abs=8), "the screen"
 
 
+def test_an_unknown_backend_is_named(
+    short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "video.mp4"
+    assert main(["replay", str(short), "--out", str(out), "--backend", "nothing"]) == 2
+    assert "there is no 'nothing'" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    "command",
     [
-        (["--out", "video.avi"], "must end in .mp4"),
-        (["--out", "video.mp4", "--backend", "nothing"], "there is no 'nothing'"),
+        ["replay", "missing.mcap", "--out", "video.avi"],
+        ["evaluate", "--policy", "missing", "--video", "video.avi"],
     ],
 )
-def test_bad_input_says_what_to_do(
-    arguments: list[str],
-    message: str,
-    short: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+def test_a_video_of_another_format_is_refused_before_anything_starts(
+    command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["replay", str(short), *arguments]) == 2
-    assert message in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
+    with pytest.raises(SystemExit) as ended:
+        main(command)
+    assert ended.value.code == 2
+    assert "video.avi: the name of a video must end in .mp4 or .gif" in capsys.readouterr().err

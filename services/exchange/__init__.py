@@ -1,0 +1,1 @@
+"""Episodes in data formats of others: a module for each format."""
