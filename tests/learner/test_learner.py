@@ -11,6 +11,7 @@ from subprocess import Popen
 
 import numpy as np
 import pytest
+from fitting import fitting_fields, settings_digest
 from outcomes import NOT_LIFTED
 from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
@@ -73,12 +74,14 @@ class LearnerSetup:
         self._stack = stack
         self._make_episode = make_episode
         self.folder = folder / "test"
+        self.settings: tuple[str, ...] = ()  # overrides that decide what must agree
         self.endpoint = free_endpoint()
         self.words = ["--connect", self.endpoint, "--set", f"run.folder={folder}"]
         for key, value in SETTINGS.items():
             self.words += ["--set", f"{key}={value}"]
         stack.enter_context(listening_hub(self.endpoint))
         self.actor = self.join("actor")
+        self.evaluator = self.join("evaluator", Role.EVALUATOR)
         self.actor.announce()
         self.policies: list[PolicyVersion] = []
         self.metrics: LearnerMetrics | None = None
@@ -93,14 +96,16 @@ class LearnerSetup:
         self.metrics = None
         self.process = self._stack.enter_context(vmdnn("learner", *self.words, *more))
 
-    def join(self, name: str) -> Bus:
-        bus = open_bus(HubConfig(endpoint=self.endpoint), "test", Role.ACTOR, name)
+    def join(self, name: str, role: Role = Role.ACTOR) -> Bus:
+        bus = open_bus(HubConfig(endpoint=self.endpoint), "test", role, name)
         return self._stack.enter_context(bus)
 
     def ask(self) -> list[TutoringCase | Correction]:
         """Send a request as an actor that has the newest policy."""
         newest = [(policy.run_id, policy.version) for policy in self.policies[-1:]]
-        request = TutoringRequest("actor", *(newest[0] if newest else ("", 0)))
+        request = TutoringRequest(
+            "actor", *(newest[0] if newest else ("", 0)), settings_digest(*self.settings)
+        )
         key = self.actor.keys.request_tutoring
         answers: list[TutoringCase | Correction]
         answers = self.actor.ask(key, request, TutoringCase, Correction)
@@ -118,15 +123,16 @@ class LearnerSetup:
 
     def correction(self, asked: Correction, **fields: object) -> Episode:
         given = {
+            **fitting_fields(asked.task, *self.settings),
             "id": f"corrected{asked.seed}",
-            "task": asked.task,
             "seed": asked.seed,
             "situation": dict(asked.situation),
             "policy_version": self.policies[-1].version,
             "training": self.policies[-1].run_id,
             **fields,
         }
-        return self._make_episode(20, kind=Kind.CORRECTION, actor="actor", **given)
+        steps = len(given["phases"])
+        return self._make_episode(steps, kind=Kind.CORRECTION, actor="actor", **given)
 
     def fail_in_practice(self, seed: int) -> Correction:
         """Report a failure of practice until the learner requests a correction there."""
@@ -136,7 +142,7 @@ class LearnerSetup:
         asked: list[TutoringCase | Correction] = []
 
         def heard() -> bool:
-            self.actor.deliver(self.actor.keys.verdict, verdict)
+            self.evaluator.deliver(self.actor.keys.verdict, verdict)
             asked.extend(self.ask())
             return bool(asked)
 
@@ -147,13 +153,14 @@ class LearnerSetup:
     def episode(self, shown: TutoringCase, **fields: object) -> Episode:
         task = make_task(TaskConfig.model_validate({"name": shown.task}))
         given = {
+            **fitting_fields(shown.task, *self.settings),
             "id": f"case{shown.case}",
-            "task": shown.task,
             "seed": shown.seed,
             "situation": dict(task.tutored()[shown.case]),
             **fields,
         }
-        return self._make_episode(20, kind=Kind.TUTORING, actor="actor", **given)
+        steps = len(given["phases"])
+        return self._make_episode(steps, kind=Kind.TUTORING, actor="actor", **given)
 
     def send(self, episode: Episode) -> str:
         """Send a sequence until its receipt arrives; return the refusal, empty if accepted."""
@@ -231,6 +238,7 @@ def test_pretraining_has_its_own_cases_and_does_not_wait_for_the_others(
 ) -> None:
     asked = {"task": "reaching", "cases": "[0,14]", "repeats": 1, "epochs": 3}
     words = [f"--set=learner.pretraining.{name}={value}" for name, value in asked.items()]
+    setup.settings = ("learner.pretraining.task=reaching",)
     setup.start(*words, "--set", "learner.publish_every_epochs=400")
     first, second = case(0, 0, "reaching"), case(14, 0, "reaching")
     assert [setup.ask_until_given(), *setup.ask(), *setup.ask()] == [first, second, case(0, 0)]

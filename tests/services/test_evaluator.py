@@ -8,6 +8,7 @@ from pathlib import Path
 from subprocess import Popen
 
 import pytest
+from fitting import fitting_fields, make_policy, settings_digest, task_called
 from outcomes import NOT_LIFTED, PRECISE
 from ports import free_endpoint
 from processes import PATIENCE_S, eventually, listening_hub, run_vmdnn, stop, vmdnn
@@ -21,7 +22,6 @@ from proto.messages import (
     Control,
     ControlReply,
     EpisodeFailed,
-    PolicyVersion,
     Receipt,
     Rollout,
     Trial,
@@ -30,6 +30,7 @@ from proto.messages import (
 )
 from proto.metrics import EvaluatorMetrics
 
+TASK = task_called("experiment1")
 MakeEpisode = Callable[..., Episode]
 
 
@@ -50,6 +51,7 @@ class EvaluatorSetup:
         stack.enter_context(listening_hub(self.endpoint))
         self.metrics: EvaluatorMetrics | None = None
         self.learner = self.join(Role.LEARNER, "learner")
+        self.learner.announce()
         self.learner.subscribe(
             self.learner.keys.metrics(Role.EVALUATOR), self._listen, EvaluatorMetrics
         )
@@ -67,11 +69,11 @@ class EvaluatorSetup:
         return self._stack.enter_context(bus)
 
     def publish(self, version: int, run_id: str = "training") -> None:
-        policy = PolicyVersion(run_id, version, 10, 0.5, "digest", b"weights")
+        policy = make_policy(version, run_id)
         self.learner.publish_newest(self.learner.keys.policy, policy)
 
     def ask(self, actor: Bus, version: int, run_id: str = "training") -> list[int]:
-        request = TrialRequest(actor.id, run_id, version)
+        request = TrialRequest(actor.id, run_id, version, settings_digest())
         key = actor.keys.request_trial
         given = actor.ask(
             key, request, Trial, timeout_s=PATIENCE_S
@@ -100,14 +102,14 @@ class EvaluatorSetup:
     def send(self, actor: Bus, seed: int, version: int, **fields: object) -> Episode:
         """Send a rollout until its receipt arrives."""
         episode = self._episode(actor, seed, version, **fields)
-        rollout = Rollout(episode, "training")
+        rollout = Rollout(episode, episode.training)
         assert self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout) == ""
         return episode
 
     def refused(self, actor: Bus, seed: int, version: int, **fields: object) -> str:
         """Send a rollout until it is refused; return the reason."""
         episode = self._episode(actor, seed, version, **fields)
-        rollout = Rollout(episode, "training")
+        rollout = Rollout(episode, episode.training)
         return self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout)
 
     def fail(self, actor: Bus, report: EpisodeFailed) -> str:
@@ -115,8 +117,17 @@ class EvaluatorSetup:
         return self._answer(actor, report.id, actor.keys.failure(actor.id), report)
 
     def _episode(self, actor: Bus, seed: int, version: int, **fields: object) -> Episode:
-        given = {"kind": Kind.TRIAL, "outcome": PRECISE, "id": f"{seed}-{version}", **fields}
-        return self._make_episode(3, actor=actor.id, seed=seed, policy_version=version, **given)
+        given = {
+            **fitting_fields(),
+            "kind": Kind.TRIAL,
+            "outcome": PRECISE,
+            "id": f"{seed}-{version}",
+            "situation": dict(TASK.sample(seed)),
+            "training": "training",
+            **fields,
+        }
+        steps = len(given["phases"])
+        return self._make_episode(steps, actor=actor.id, seed=seed, policy_version=version, **given)
 
     def _answer(self, actor: Bus, name: str, key: str, message: object) -> str:
         receipts: list[Receipt] = []
@@ -159,7 +170,7 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
     setup.send(other, 70, 1, id="another-episode-of-this-trial", outcome=NOT_LIFTED)
     setup.send(other, 71, 1, outcome=NOT_LIFTED)
     assert setup.refused(other, 99, 1) == "no trial with the seed 99 is asked for"
-    setup.send(actor, 5, 1, kind=Kind.PRACTICE)
+    setup.send(actor, 2**30 + 5, 1, kind=Kind.PRACTICE)
     metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 2})
     score = metrics.policies[0]
     assert (score.precise.successes, score.precise.rate) == (1, 0.5)
@@ -169,6 +180,7 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
 
     setup.publish(2)
     assert setup.ask_until_given(actor, 2) == 70
+    assert [*setup.ask(actor, 2), *setup.ask(actor, 2)] == [71, 72]
     assert setup.ask(actor, 1) == [], "only the newest policy is tried"
     setup.send(actor, 72, 1)  # was under way when the newer policy came
     for seed in (70, 71, 72):
@@ -221,6 +233,7 @@ def test_a_trial_whose_simulation_fails_is_a_failure_and_is_not_played_again(
     setup.publish(1)
     assert setup.ask_until_given(actor, 1) == 70
     trial = {"actor": "a", "kind": Kind.TRIAL, "training": "training", "policy_version": 1}
+    trial["situation"] = dict(TASK.sample(70))
     assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
     assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
     assert "seed 99" in setup.fail(actor, failure("nobody-asked", seed=99, **trial))
