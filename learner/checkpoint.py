@@ -61,6 +61,7 @@ class _Model(BaseModel):
 
 
 CodeEnd = Annotated[float, Field(ge=-_WIDEST_CODE, le=_WIDEST_CODE, allow_inf_nan=False)]
+RunName = Annotated[str, Field(max_length=256, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 Version = Annotated[int, Field(ge=0, le=LARGEST_VERSION)]
 Natural = Annotated[int, Field(ge=0, le=2**31)]
 
@@ -138,7 +139,7 @@ class CheckpointMetadata(_Model):
     """
 
     format: Literal[1, 2] = 2
-    run: str
+    run: RunName
     version: Version
     stage: Stage
     epoch: Natural

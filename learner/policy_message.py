@@ -52,7 +52,7 @@ def policy_of(message: PolicyVersion, config: Config) -> Checkpoint:
 
     Raises:
         UserError: the policy is damaged, contradicts its message, or is none of this run: of
-            another run, task or network, or one that cannot act.
+            another task or network, or one that cannot act.
     """
     checkpoint = checkpoint_from_bytes(message.weights, _ORIGIN)
     metadata = checkpoint.metadata
@@ -63,8 +63,6 @@ def policy_of(message: PolicyVersion, config: Config) -> Checkpoint:
             f"{_ORIGIN} contradicts its message: version, epoch, loss and digest are"
             f" {plain(held, 300)}, but the message says {plain(told, 300)}"
         )
-    if metadata.run != config.run.name:
-        raise UserError(f"{_ORIGIN} is of the run {plain(metadata.run, 100)}")
     if metadata.task != config.task.name:
         raise UserError(f"{_ORIGIN} was trained for the task {plain(metadata.task, 100)}")
     if metadata.training is not None or metadata.rival is not None or metadata.code is None:

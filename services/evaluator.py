@@ -31,6 +31,7 @@ from proto.messages import (
 from proto.metrics import EvaluatorMetrics, PolicyScore, Success
 from proto.plain_text import plain
 from proto.seeds import PRACTICE
+from proto.storage import make_folder
 from services.trials.asked import AskedTrials, NotYetError
 from services.trials.success import Tally
 from services.trials.trial_log import TrialLog
@@ -71,7 +72,10 @@ class Evaluator:
         self._seeds = range(first, first + config.evaluator.trials_per_policy)
         self._task = task
         self._agreement = Agreement(config, bus)
-        self._asked: AskedTrials[int] = AskedTrials(self._log.versions)
+        self._folder = config.run_folder / "evaluation"
+        self._asked: AskedTrials[int] = AskedTrials(
+            self._log.versions, has_predecessor=self._folder.exists()
+        )
 
     def run(self) -> None:
         """Evaluate until it should stop.
@@ -83,6 +87,7 @@ class Evaluator:
         alone_in_run(self._bus, self._lifecycle)
         self._agreement.check()
         self._agreement.answer()
+        make_folder(self._folder)  # shows the next process that there was one before
         keys = self._bus.keys
         rollouts = self._bus.inbox(keys.rollout(), Rollout, capacity=WAITING)
         failures = self._bus.inbox(keys.failure(), EpisodeFailed, capacity=WAITING)

@@ -27,13 +27,17 @@ class AskedTrials(Generic[Item]):
         newest: the newest policy, or ("", 0) before any was heard of.
     """
 
-    def __init__(self, counted_versions: Callable[[str], list[int]]) -> None:
+    def __init__(
+        self, counted_versions: Callable[[str], list[int]], *, has_predecessor: bool
+    ) -> None:
         """Begin without leases.
 
         Args:
             counted_versions: gives the policy versions of a training whose trials were counted,
                 by this process or a predecessor, oldest first.
+            has_predecessor: whether another process evaluated this run before.
         """
+        self._has_predecessor = has_predecessor
         self.newest: PolicyKey = ("", 0)
         self._first: PolicyKey | None = None
         self._given: set[tuple[PolicyKey, Item, str]] = set()
@@ -78,7 +82,7 @@ class AskedTrials(Generic[Item]):
 
     def _may_be_older(self, policy: PolicyKey) -> bool:
         """Whether a predecessor of this process may have handed out trials of a policy."""
-        if self._first is None:
+        if self._first is None or not self._has_predecessor:
             return False
         first_run, first_version = self._first
         # Trainings change one after another: one that is not the first heard of came before it,

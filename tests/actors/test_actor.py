@@ -21,7 +21,7 @@ from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 from actors.tasks.experiment1.plan import plan
 from actors.tasks.registry import make_task
 from proto.bus import Bus, open_bus
-from proto.config import HubConfig, TaskConfig
+from proto.config import HubConfig, TaskConfig, load_config
 from proto.episode import Episode, Kind
 from proto.keys import Role
 from proto.messages import (
@@ -262,6 +262,48 @@ def test_a_policy_changes_between_episodes_only(
     assert {step for _, step in changes} == {0}
     versions = [(r.run_id, r.episode.policy_version) for r in list(setup.rollouts)]
     assert list(dict.fromkeys(versions)) == [("training", 1), ("training", 3), ("new", 1)]
+
+
+def test_policies_that_do_not_fit_are_refused_and_it_goes_on(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    setup.publish(policy(1))
+    setup.start_actor()
+    eventually(lambda: bool(setup.rollouts), "it practises with policy 1")
+    other = load_config(None, ["network.mstnn_fast.stride=3"]).network
+    for odd in (
+        policy(10**6, network=other),
+        replace(policy(2), version=1000, epoch=1000),
+        policy(3, task="reaching"),
+        replace(policy(4), weights=b"damaged"),
+    ):
+        setup.publish(odd)
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.refused == 4)
+    assert metrics.policy_version == 1
+    played = metrics.episodes
+    setup.wait_for_metrics(lambda metrics: metrics.episodes > played)
+    setup.publish(policy(2))
+    setup.wait_for_metrics(lambda metrics: metrics.policy_version == 2)
+
+
+def test_receipts_of_those_who_store_nothing_delete_nothing(setup: ActorSetup) -> None:
+    setup.gives_receipts = False
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.start_actor()
+    eventually(lambda: len(setup.sequences) >= 1, "a demonstration")
+    receipt = Receipt(setup.sequences[0].id)
+    key = setup.bus.keys.receipt("actor-1")
+    hub = HubConfig(endpoint=setup.endpoint)
+    with (
+        open_bus(hub, "test", Role.WATCH, "stranger") as stranger,
+        open_bus(hub, "test", Role.LEARNER, "absent") as absent,
+    ):
+        for bus in (stranger, absent, setup.evaluator):
+            bus.deliver(key, receipt)
+        metrics = setup.wait_for_metrics(lambda metrics: metrics.refused == 2)
+    assert metrics.outbox == 1
+    setup.bus.deliver(key, receipt)
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
 
 
 def test_a_killed_actor_sends_messages_without_receipt_again(setup: ActorSetup) -> None:

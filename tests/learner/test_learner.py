@@ -43,7 +43,7 @@ from proto.messages import (
     Verdict,
 )
 from proto.metrics import LearnerMetrics, Stage
-from proto.recordings.episodes import read_episode
+from proto.recordings.episodes import read_episode, write_episode
 
 MakeEpisode = Callable[..., Episode]
 SETTINGS = {
@@ -74,7 +74,7 @@ class LearnerSetup:
         self._stack = stack
         self._make_episode = make_episode
         self.folder = folder / "test"
-        self.settings: tuple[str, ...] = ()  # overrides that decide what must agree
+        self.settings = [f"{key}={value}" for key, value in SETTINGS.items()]
         self.endpoint = free_endpoint()
         self.words = ["--connect", self.endpoint, "--set", f"run.folder={folder}"]
         for key, value in SETTINGS.items():
@@ -233,12 +233,58 @@ def test_it_requests_each_case_once_and_stores_the_sequences(setup: LearnerSetup
     assert stop(setup.process) == 0
 
 
+def test_sequences_that_do_not_fit_are_refused_and_a_poisoned_folder_is_cleared(
+    setup: LearnerSetup,
+) -> None:
+    setup.start()
+    shown = setup.ask_until_given()
+    assert isinstance(shown, TutoringCase)
+    fine = setup.episode(shown)
+    one_step = {
+        name: getattr(fine, name)[:1]
+        for name in ("images", "actions", "targets", "joints_deg", "phases", "body_poses")
+    } | {"outputs": None}
+    outside = {**fine.situation, "object_y_m": 1e12}
+    for name, wrong, problem in (
+        ("one-step", one_step, "it has 1 steps"),
+        ("nowhere", {"situation": {}}, "its situation is not the one of the seed 0"),
+        ("outside", {"situation": outside}, "its situation is not the one of the seed 0"),
+        ("foreign", {"config_digest": "other"}, "its configuration is not that of this run"),
+        ("too-far", {"actions": fine.actions - 300}, "not within what the robot accepts"),
+        ("phases", {"phases": np.zeros_like(fine.phases)}, "its phases are not those"),
+        ("too-late", {"seed": 2**60}, "no tutored case"),
+    ):
+        assert problem in setup.send(replace(fine, id=name, **wrong))
+    assert setup.send(fine) == ""
+    same_id = setup.send(replace(setup.episode(case(20, 0)), id=fine.id))
+    assert same_id == "another sequence with this id is stored"
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.sequences == 1)
+    assert (metrics.stage, metrics.refused) == (Stage.WAITING, 8)
+
+    setup.process.kill()
+    setup.process.wait()
+    folder = setup.folder / "tutoring"
+    poison = setup.episode(case(20, 0))
+    write_episode(folder / "p1.mcap", replace(poison, id="p1", situation={}))
+    write_episode(folder / "p2.mcap", replace(poison, targets=poison.targets * 1e12, id="../p2"))
+    short = setup.episode(case(20, 0), **one_step)
+    write_episode(folder / "p3.mcap", replace(short, id="p3"))
+    setup.start()
+    assert setup.ask_until_given() == case(20, 0), "it is still missing"
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.sequences == 1)
+    assert metrics.damaged == 3
+    assert {path.name for path in folder.iterdir()} == {
+        *("case0.mcap", "p1.refused", "p2.refused", "p3.refused")
+    }
+    assert stop(setup.process) == 0
+
+
 def test_pretraining_has_its_own_cases_and_does_not_wait_for_the_others(
     setup: LearnerSetup,
 ) -> None:
     asked = {"task": "reaching", "cases": "[0,14]", "repeats": 1, "epochs": 3}
     words = [f"--set=learner.pretraining.{name}={value}" for name, value in asked.items()]
-    setup.settings = ("learner.pretraining.task=reaching",)
+    setup.settings.append("learner.pretraining.task=reaching")
     setup.start(*words, "--set", "learner.publish_every_epochs=400")
     first, second = case(0, 0, "reaching"), case(14, 0, "reaching")
     assert [setup.ask_until_given(), *setup.ask(), *setup.ask()] == [first, second, case(0, 0)]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from subprocess import Popen
 
+import numpy as np
 import pytest
 from fitting import fitting_fields, make_policy, settings_digest, task_called
 from outcomes import NOT_LIFTED, PRECISE
@@ -15,7 +17,7 @@ from processes import PATIENCE_S, eventually, listening_hub, run_vmdnn, stop, vm
 
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig
-from proto.episode import Episode, Kind
+from proto.episode import Episode, Kind, Outcome
 from proto.keys import Role
 from proto.messages import (
     Command,
@@ -29,6 +31,8 @@ from proto.messages import (
     Verdict,
 )
 from proto.metrics import EvaluatorMetrics
+from services.evaluator import _reasons
+from services.trials.success import Tally
 
 TASK = task_called("experiment1")
 MakeEpisode = Callable[..., Episode]
@@ -189,6 +193,60 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
     assert metrics.done
     assert metrics.leases == 0
     assert setup.ask(actor, 2) == [], "the newest policy is counted in full"
+
+
+def test_nothing_counts_that_was_not_asked_for(setup: EvaluatorSetup) -> None:
+    actor, stranger = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "s")
+    setup.publish(1)
+    assert setup.ask_until_given(actor, 1) == 70
+    request = TrialRequest("s", "training", 1, settings_digest("task.attention=fixed"))
+    assert stranger.ask(stranger.keys.request_trial, request, Trial) == []
+    for name, wrong, problem in (
+        ("no-lease", {}, "was not asked of s"),
+        ("no-training", {"training": "invented"}, "no policy 1 of the training invented"),
+        ("no-place", {"situation": {}}, "its situation is not the one of the seed 70"),
+        ("case", {"situation": dict(TASK.sample(71))}, "its situation is not the one"),
+    ):
+        assert problem in setup.refused(stranger, 70, 1, id=name, **wrong)
+    for name, wrong, problem in (
+        ("config", {"config_digest": settings_digest("task.attention=fixed")}, "configuration"),
+        ("short", {"phases": TASK.phases[:9], "actions": np.zeros((9, 11), np.float32)}, "9 steps"),
+    ):
+        steps = len(wrong.get("phases", TASK.phases))  # type: ignore[arg-type]
+        fields = {"targets": np.zeros((steps, 11), np.float32), **wrong}
+        assert problem in setup.refused(actor, 70, 1, id=name, **fields)
+
+    # Policies that this run never published change nothing, nor do trials of them.
+    for odd in (make_policy(10**6, task="reaching"), replace(make_policy(2), version=5, epoch=50)):
+        setup.learner.publish_newest(setup.learner.keys.policy, odd)
+    unheard = Rollout(setup._episode(stranger, 70, 9, id="version-9"), "training")
+    stranger.deliver(stranger.keys.rollout("s"), unheard)
+    setup.send(actor, 70, 1, outcome=PRECISE)
+    many = [Outcome(False, False, False, f"reason_{number}", {}) for number in range(2)]
+    assert [*setup.ask(actor, 1), *setup.ask(actor, 1)] == [71, 72]
+    for seed, outcome in zip((71, 72), many, strict=True):
+        setup.send(actor, seed, 1, outcome=outcome)
+    metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 3})
+    assert metrics.policies[0].reasons == {"reason_0": 1, "reason_1": 1}
+    assert metrics.refused == 9
+
+
+def test_many_reasons_fit_into_the_metrics() -> None:
+    tally = Tally.of(Outcome(False, False, False, f"reason_{n}", {}) for n in range(100))
+    told = _reasons(tally)
+    assert len(told) == 32
+    assert sum(told.values()) == 100
+
+
+def test_a_trial_that_an_evaluator_before_asked_for_is_not_lost(setup: EvaluatorSetup) -> None:
+    actor = setup.join(Role.ACTOR, "a")
+    setup.publish(1)
+    assert setup.ask_until_given(actor, 1) == 70
+    setup.process.kill()
+    setup.process.wait()
+    setup.start()
+    setup.send(actor, 70, 1)
+    setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 1})
 
 
 def test_the_learner_gets_verdicts_of_practice_but_not_of_trials(
