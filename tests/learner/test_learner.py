@@ -250,7 +250,7 @@ def test_sequences_that_do_not_fit_are_refused_and_a_poisoned_folder_is_cleared(
         ("nowhere", {"situation": {}}, "its situation is not the one of the seed 0"),
         ("outside", {"situation": outside}, "its situation is not the one of the seed 0"),
         ("foreign", {"config_digest": "other"}, "its configuration is not that of this run"),
-        ("too-far", {"actions": fine.actions - 300}, "not within what the robot accepts"),
+        ("too-far", {"actions": fine.actions - 100}, "not within what the robot accepts"),
         ("phases", {"phases": np.zeros_like(fine.phases)}, "its phases are not those"),
         ("too-late", {"seed": 2**60}, "no tutored case"),
     ):
@@ -259,7 +259,8 @@ def test_sequences_that_do_not_fit_are_refused_and_a_poisoned_folder_is_cleared(
     same_id = setup.send(replace(setup.episode(case(20, 0)), id=fine.id))
     assert same_id == "another sequence with this id is stored"
     metrics = setup.wait_for_metrics(lambda metrics: metrics.sequences == 1)
-    assert (metrics.stage, metrics.refused) == (Stage.WAITING, 8)
+    assert metrics.stage is Stage.WAITING
+    assert metrics.refused >= 8, "messages are sent until they are answered"
 
     setup.process.kill()
     setup.process.wait()

@@ -228,7 +228,7 @@ def test_nothing_counts_that_was_not_asked_for(setup: EvaluatorSetup) -> None:
         setup.send(actor, seed, 1, outcome=outcome)
     metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 3})
     assert metrics.policies[0].reasons == {"reason_0": 1, "reason_1": 1}
-    assert metrics.refused == 9
+    assert metrics.refused >= 9, "messages are sent until they are answered"
 
 
 def test_many_reasons_fit_into_the_metrics() -> None:
