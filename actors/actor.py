@@ -6,26 +6,29 @@ import logging
 import secrets
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
 from actors.player import LiveStep, play
-from actors.policies.by_name import check_task
 from actors.policies.contract import Policy
 from actors.policies.guided import GuidedPolicy
 from actors.policies.planned import make_tutor
 from actors.simulator import make_simulator
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
-from learner.checkpoint import checkpoint_from_bytes
+from learner.checkpoint import Checkpoint
 from learner.network_policy import NetworkPolicy
+from learner.policy_message import policy_of
+from proto.agreement import ANSWERING, Agreement
 from proto.bus import Bus
 from proto.codec import MessageError, encode
 from proto.config import Config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
+from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import membership
 from proto.messages import (
@@ -45,7 +48,9 @@ from proto.metrics import ActorMetrics
 from proto.outbox import Outbox
 from proto.pace import Pace
 from proto.periodic import every
+from proto.plain_text import plain
 from proto.seeds import PRACTICE
+from proto.senders import Sender
 from proto.variables import Situation
 
 LOG = logging.getLogger(__name__)
@@ -55,6 +60,8 @@ IDLE_S: Final = 0.3
 OUTBOX_PERIOD_S: Final = 1.0
 OUTBOX_LIMIT: Final = 100
 """An actor plays no more for a receiver that owes it so many receipts."""
+COMPARE_AGAIN_S: Final = 5.0
+"""How long to wait before the settings are compared again, if they differ."""
 PRACTICE_LIMIT: Final = 8
 """An actor does not practise when so many rollouts are without a receipt."""
 
@@ -78,6 +85,25 @@ class Assignment:
     situation: Situation
     seed: int
     training: str = ""
+
+
+@dataclass(frozen=True)
+class _Offer:
+    """A policy that was published and fits the run.
+
+    Attributes:
+        run_id: id of its training.
+        version: its version.
+        checkpoint: the policy.
+    """
+
+    run_id: str
+    version: int
+    checkpoint: Checkpoint
+
+    def is_newer_than(self, run_id: str, version: int) -> bool:
+        """Whether it is of another training, or of this one and newer."""
+        return self.run_id != run_id or self.version > version
 
 
 def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
@@ -120,7 +146,9 @@ class Actor:
         self._config = config
         self._bus = bus
         self._lifecycle = lifecycle
-        self._digest = config.digest()
+        self._agreement = Agreement(config, bus)
+        self._joined = threading.Event()  # set when a learner or evaluator has joined or gone
+        self._present: set[Sender] = set()  # learners and evaluators
         self._task = make_task(config.task)
         self._tasks = {self._task.name: self._task}
         if (first := config.pretraining_task) is not None:
@@ -131,21 +159,26 @@ class Actor:
         self._rollouts = Outbox(outbox / "rollouts", bus.deliver_wire)
         self._policy: NetworkPolicy | None = None
         self._policy_run = ""
-        self._offered: PolicyVersion | None = None
+        self._offered: _Offer | None = None
         self._offering = threading.Lock()
         self._pace = Pace()
         self._episodes = 0
         self._failed = 0
+        self._refused_policies = 0
         self._last: Episode | None = None
 
     def run(self) -> None:
         """Play until it should stop; the episode that is played then is given up.
 
         Raises:
-            UserError: an episode cannot be written to disk.
+            UserError: its configuration does not fit the run, or an episode cannot be written to
+                disk.
         """
         keys = self._bus.keys
-        self._bus.subscribe(keys.receipt(self._bus.id), self._on_receipt, Receipt)
+        for role in ANSWERING:
+            self._bus.watch_presence(role, self._on_presence_of(role))
+        self._agreement.check()
+        self._bus.subscribe_with_sender(keys.receipt(self._bus.id), self._on_receipt, Receipt)
         self._bus.subscribe_newest(keys.policy, self._on_policy, PolicyVersion)
         try:
             with (
@@ -164,7 +197,7 @@ class Actor:
         return ActorMetrics(
             id=self._bus.id,
             time_s=time.time(),
-            refused=self._bus.refused,
+            refused=self._bus.refused + self._refused_policies,
             policy_version=self._policy.version if self._policy else 0,
             steps_per_s=self._pace.per_second(),
             episodes=self._episodes,
@@ -187,7 +220,7 @@ class Actor:
 
     def _play_next(self) -> None:
         assignment = None
-        if not self._lifecycle.paused:
+        if not self._lifecycle.paused and self._agrees():
             self._take_newest_policy()
             assignment = self._tutoring() or self._trial() or self._practice()
         if assignment is None:
@@ -205,12 +238,34 @@ class Actor:
         self._episodes += 1
         self._last = episode
 
+    def _agrees(self) -> bool:
+        """Whether the settings still fit the run; compared when a learner or evaluator joined."""
+        if not self._joined.is_set():
+            return True
+        self._joined.clear()
+        if problem := self._agreement.problem():
+            LOG.error("plays nothing until this is mended: %s", problem)
+            self._joined.set()
+            self._lifecycle.wait(COMPARE_AGAIN_S)
+            return False
+        return True
+
+    def _on_presence_of(self, role: Role) -> Callable[[str, bool], None]:
+        def on_change(name: str, alive: bool) -> None:
+            if alive:
+                self._present.add(Sender(role, name))
+                self._joined.set()
+            else:
+                self._present.discard(Sender(role, name))
+
+        return on_change
+
     def _tutoring(self) -> Assignment | None:
         """A tutored case or a correction that the learner asks for; None if there is none."""
         if len(self._sequences) >= OUTBOX_LIMIT:
             return None
         version = self._policy.version if self._policy else 0
-        request = TutoringRequest(self._bus.id, self._policy_run, version)
+        request = TutoringRequest(self._bus.id, self._policy_run, version, self._agreement.digest)
         key = self._bus.keys.request_tutoring
         answers: list[TutoringCase | Correction]
         answers = self._bus.ask(key, request, TutoringCase, Correction)
@@ -220,7 +275,7 @@ class Actor:
                     return self._guidance(answer)
                 return self._demonstration(answer)
             except UserError as error:
-                LOG.warning("the learner's request cannot be played: %s", error)
+                LOG.warning("the learner's request cannot be played: %s", plain(error))
         return None
 
     def _demonstration(self, asked: TutoringCase) -> Assignment:
@@ -232,7 +287,7 @@ class Actor:
         task = self._task_called(asked.task)
         situations = task.tutored()
         if asked.case >= len(situations):
-            raise UserError(f"{asked.task} has no tutored case {asked.case}")
+            raise UserError(f"{task.name} has no tutored case {asked.case}")
         tutor = make_tutor(task, self._config.tutor if asked.repeat > 0 else None)
         return Assignment(Kind.TUTORING, task, tutor, situations[asked.case], asked.seed)
 
@@ -261,7 +316,9 @@ class Actor:
         """A trial of this policy that the evaluator asks for; None if there is none."""
         if self._policy is None or len(self._rollouts) >= OUTBOX_LIMIT:
             return None
-        request = TrialRequest(self._bus.id, self._policy_run, self._policy.version)
+        request = TrialRequest(
+            self._bus.id, self._policy_run, self._policy.version, self._agreement.digest
+        )
         for trial in self._bus.ask(self._bus.keys.request_trial, request, Trial):
             situation = self._task.sample(trial.seed)
             return Assignment(
@@ -301,7 +358,7 @@ class Actor:
                 seed=assignment.seed,
                 kind=assignment.kind,
                 actor=self._bus.id,
-                config_digest=self._digest,
+                config_digest=self._agreement.digest,
                 on_step=on_step,
             )
         except (ArithmeticError, ValueError, RuntimeError) as error:
@@ -349,41 +406,47 @@ class Actor:
             situation=dict(failed.situation),
             training=failed.training,
             policy_version=failed.policy.version,
-            problem=ascii(problem)[1:-1][:1000],
+            problem=plain(problem)[:1000],
         )
         outbox = self._rollouts if failed.kind is Kind.TRIAL else self._sequences
         outbox.add(report.id, self._bus.keys.failure(self._bus.id), encode(report))
 
-    def _on_receipt(self, receipt: Receipt) -> None:
-        for outbox in (self._sequences, self._rollouts):
-            if receipt.refusal:
-                outbox.refused(receipt.episode, receipt.refusal)
-            else:
-                outbox.received(receipt.episode)
+    def _on_receipt(self, receipt: Receipt, sender: Sender) -> None:
+        """Believe a receipt for what was sent to this sender, if it is there."""
+        if sender not in self._present:
+            self._bus.refuse(str(sender), "it gives receipts, but is not present in this run")
+            return
+        outbox = self._sequences if sender.role is Role.LEARNER else self._rollouts
+        if receipt.refusal:
+            outbox.refused(receipt.episode, receipt.refusal)
+        else:
+            outbox.received(receipt.episode)
 
-    def _on_policy(self, offered: PolicyVersion) -> None:
+    def _on_policy(self, message: PolicyVersion) -> None:
+        """Keep the newest policy of this run until the next episode begins."""
+        try:
+            offered = _Offer(message.run_id, message.version, policy_of(message, self._config))
+        except UserError as error:
+            self._refused_policies += 1
+            LOG.warning("policy %d cannot be used: %s", message.version, plain(error))
+            return
         with self._offering:
             waiting = self._offered
-            if waiting is None or _is_newer(offered, waiting.run_id, waiting.version):
+            if waiting is None or offered.is_newer_than(waiting.run_id, waiting.version):
                 self._offered = offered
 
     def _take_newest_policy(self) -> None:
         with self._offering:
             offered, self._offered = self._offered, None
         held = self._policy.version if self._policy else 0
-        if offered is None or not _is_newer(offered, self._policy_run, held):
+        if offered is None or not offered.is_newer_than(self._policy_run, held):
             return
         try:
-            checkpoint = checkpoint_from_bytes(offered.weights, "the policy")
-            check_task(checkpoint, self._task.name, "the policy")
-            self._policy = NetworkPolicy(checkpoint, "the policy")
-        except UserError as error:
-            LOG.warning("policy %d cannot be used: %s", offered.version, error)
+            policy = NetworkPolicy(offered.checkpoint, "the policy")
+        except (ValueError, MemoryError) as error:
+            self._refused_policies += 1
+            LOG.warning("policy %d cannot be used: %s", offered.version, plain(error))
             return
+        self._policy = policy
         self._policy_run = offered.run_id
         LOG.info("acts with policy %d from now on", self._policy.version)
-
-
-def _is_newer(offered: PolicyVersion, run_id: str, version: int) -> bool:
-    """Whether a policy is of another training, or of this one and newer."""
-    return offered.run_id != run_id or offered.version > version

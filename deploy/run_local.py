@@ -24,6 +24,7 @@ from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
 from services.arguments.common import config_argument, integer
 from services.board import Board, RunView
 from services.machine.ports import port_trouble
+from services.terminal.console import make_console
 from services.terminal.display import display
 from services.terminal.run_words import success_words
 
@@ -64,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         actors = default_actors() if arguments.actors is None else arguments.actors
         if trouble := port_trouble(config.hub.endpoint):
             raise UserError(trouble)
-        run(config, actors, Console())
+        run(config, actors, make_console())
     except UserError as error:
         print(f"run_local: {error}", file=sys.stderr)
         return BAD_INPUT

@@ -10,11 +10,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
@@ -23,9 +23,11 @@ from learner.network.softmax_code import SoftmaxCode
 from learner.network.subnets import parameter_shapes
 from learner.pretrained import checkpoint_path
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
-from proto.config import NetworkConfig, RivalKind
+from proto.config import NetworkConfig, RivalKind, Units
 from proto.errors import UserError
+from proto.messages import LARGEST_VERSION
 from proto.metrics import Stage
+from proto.plain_text import plain, plain_lines
 from proto.storage import written_whole
 
 Tensors = Mapping[str, NDArray[np.generic]]
@@ -34,6 +36,20 @@ _METADATA_KEY: Final = "vmdnn"
 NETWORK_PREFIX: Final = "network."
 CLASSIFIER_PREFIX: Final = "classifier."
 _WINDOW_OF_FORMAT_1: Final = (0.75, 1.0)
+_LARGEST_WEIGHT: Final = 1e6
+"""With weights of at most this magnitude no sum in the network leaves float32."""
+_WIDEST_CODE: Final = 1e4
+"""Largest magnitude of an end of the range of an action value (degrees, or levels)."""
+_BROKEN: Final = (
+    SafetensorError,
+    ValueError,  # also what pydantic and json raise
+    TypeError,
+    AttributeError,
+    RecursionError,
+    OverflowError,
+    MemoryError,
+)
+"""What reading damaged or foreign bytes raises."""
 
 
 Classes = tuple[float, ...] | tuple[str, ...]
@@ -44,11 +60,25 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+CodeEnd = Annotated[float, Field(ge=-_WIDEST_CODE, le=_WIDEST_CODE, allow_inf_nan=False)]
+RunName = Annotated[str, Field(max_length=256, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+Version = Annotated[int, Field(ge=0, le=LARGEST_VERSION)]
+Natural = Annotated[int, Field(ge=0, le=2**31)]
+
+
 class CodeRanges(_Model):
     """Ranges of the action values that the outputs code, fixed when coupled training starts."""
 
-    minima: tuple[float, ...]
-    maxima: tuple[float, ...]
+    minima: tuple[CodeEnd, ...]
+    maxima: tuple[CodeEnd, ...]
+
+    @model_validator(mode="after")
+    def _is_of_actions(self) -> Self:
+        if not len(self.minima) == len(self.maxima) == ACTION_SIZE:
+            raise ValueError(f"the code is not for {ACTION_SIZE} action values")
+        if any(low >= high for low, high in zip(self.minima, self.maxima, strict=True)):
+            raise ValueError("the code has a range that is empty")
+        return self
 
 
 class AskedMetadata(_Model):
@@ -84,7 +114,7 @@ class RivalMetadata(_Model):
     """
 
     kind: RivalKind
-    units: int
+    units: Units
 
 
 class CheckpointMetadata(_Model):
@@ -109,18 +139,18 @@ class CheckpointMetadata(_Model):
     """
 
     format: Literal[1, 2] = 2
-    run: str
-    version: int
+    run: RunName
+    version: Version
     stage: Stage
-    epoch: int
+    epoch: Natural
     loss: float | None
     config_digest: str
     task: str | None = None
     backend: str | None = None
     network: NetworkConfig
     code: CodeRanges | None
-    cases: int = 0
-    sequences: int = 0
+    cases: Natural = 0
+    sequences: Natural = 0
     training: TrainingMetadata | None = None
     rival: RivalMetadata | None = None
 
@@ -172,16 +202,17 @@ def checkpoint_from_bytes(blob: bytes, origin: str) -> Checkpoint:
     try:
         tensors = load_tensors(blob)
         header_size = int.from_bytes(blob[:8], "little")
-        text = json.loads(blob[8 : 8 + header_size])["__metadata__"][_METADATA_KEY]
-    except SafetensorError as error:
+        notes = json.loads(blob[8 : 8 + header_size]).get("__metadata__") or {}
+        text = notes.get(_METADATA_KEY)
+    except (*_BROKEN, KeyError) as error:
         raise UserError(
-            f"{origin} is not a checkpoint, or is damaged ({error}); take another one"
+            f"{origin} is not a checkpoint, or is damaged ({plain(error, 300)}); take another one"
         ) from error
-    except KeyError as error:
+    if text is None:
         raise UserError(
             f"{origin} is a safetensors file, but not of vmdnn: it lacks the metadata"
             f" {_METADATA_KEY!r}"
-        ) from error
+        )
     checkpoint = Checkpoint(_metadata(text, origin), tensors)
     _check_tensors(checkpoint, origin)
     return checkpoint
@@ -247,9 +278,10 @@ def _metadata(text: str, origin: str) -> CheckpointMetadata:
         if isinstance(values, dict) and values.get("format", 1) == 1:
             _convert_format_1(values, origin)
         return CheckpointMetadata.model_validate(values)
-    except (json.JSONDecodeError, ValidationError, AttributeError) as error:
+    except (*_BROKEN, KeyError) as error:
         raise UserError(
-            f"{origin} was written by another version of vmdnn, or is damaged: {error}"
+            f"{origin} was written by another version of vmdnn, or is damaged:"
+            f" {plain_lines(error)[:2000]}"
         ) from error
 
 
@@ -279,15 +311,17 @@ def _check_tensors(checkpoint: Checkpoint, origin: str) -> None:
         )
         name = wrong[0]
         raise UserError(
-            f"{origin} does not hold the network that its metadata describes: {name} has shape"
+            f"{origin} does not hold the network that its metadata describes:"
+            f" {plain(name, 100)} has shape"
             f" {shapes.get(name)}, not {wanted.get(name)}"
         )
     for name, tensor in network.items():
         if tensor.dtype != np.float32 or not np.isfinite(tensor).all():
-            raise UserError(f"{origin}: {name} is not all finite float32 numbers")
-    code = checkpoint.metadata.code
-    if code is not None and not len(code.minima) == len(code.maxima) == ACTION_SIZE:
-        raise UserError(f"{origin}: its code is not for {ACTION_SIZE} action values")
+            raise UserError(f"{origin}: {plain(name, 100)} is not all finite float32 numbers")
+        if tensor.size and max(-float(tensor.min()), float(tensor.max())) > _LARGEST_WEIGHT:
+            raise UserError(
+                f"{origin}: {plain(name, 100)} has weights that exceed {_LARGEST_WEIGHT:g}"
+            )
 
 
 def training_file(run_folder: Path) -> Path:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from learner.checkpoint import load_checkpoint, policy_file, pretraining_file, training_file
+from learner.checkpoint import policy_file, pretraining_file, training_file
+from learner.policy_message import policy_message
 from learner.training.training_run import (
     open_training,
     policy_is_due,
@@ -19,20 +20,22 @@ from learner.training.training_run import (
     write_policy,
 )
 from learner.training.vmdnn_recipe import VMDNNRecipe
-from learner.tutoring.corrections import Round, Situations
+from learner.tutoring.corrections import Round, Situations, situation_of_correction
 from learner.tutoring.curriculum import Curriculum
 from learner.tutoring.failures import TRIES, Shown
 from learner.tutoring.store import TutoringStore
+from proto.acceptance import misfit, same_situation
+from proto.agreement import OTHER_SETTINGS, Agreement
 from proto.bus import Bus, Inbox
 from proto.config import Config
-from proto.episode import Kind
+from proto.episode import Episode, Kind
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import alone_in_run, membership
 from proto.messages import (
+    LARGEST_LOSS,
     Correction,
     EpisodeFailed,
-    PolicyVersion,
     Receipt,
     Sequence,
     TutoringCase,
@@ -41,7 +44,12 @@ from proto.messages import (
 )
 from proto.metrics import LearnerMetrics, Stage
 from proto.pace import Pace
+from proto.plain_text import plain
+from proto.recordings.episodes import EpisodeSummary
+from proto.seeds import SEEDS_PER_CASE
+from proto.senders import Sender
 from proto.storage import written_whole
+from proto.variables import Situation
 
 LOG = logging.getLogger(__name__)
 
@@ -96,8 +104,11 @@ class Learner:
         self._folder = config.run_folder
         tutored_cases = {name: len(task.tutored()) for name, task in tasks.items()}
         self._curriculum = Curriculum(config, tutored_cases)
+        self._tasks = tasks
         self._situations = tasks[config.task.name]
+        self._agreement = Agreement(config, bus)
         self._stores = _stores(config)
+        found = self._check_stores()
         self._materials = self._make_materials()
         self._trainer = open_training(
             VMDNNRecipe(
@@ -112,20 +123,22 @@ class Learner:
         )
         self._training = threading.Lock()  # held while the trainer changes or is written to disk
         self._run_id = _run_id(self._folder)
-        self._round = self._make_round()
+        self._round = self._make_round(resumed=True)
         self._given_up = 0
-        for store in self._stores.values():
-            for summary in store.summaries():
-                self._note(summary)
+        for shown in found:
+            self._note(shown)
         self._pace = Pace()
 
     def run(self) -> None:
         """Learn until it should stop, then save the training.
 
         Raises:
-            UserError: the run has a learner already, the training diverged, or the disk is full.
+            UserError: the run has a learner already, its evaluator has another configuration, the
+                training diverged, or the disk is full.
         """
         alone_in_run(self._bus, self._lifecycle)
+        self._agreement.check()
+        self._agreement.answer()
         self._config.save(self._folder / "config.yaml")
         self._publish()
         keys = self._bus.keys
@@ -151,11 +164,12 @@ class Learner:
             stage=self._stage,
             epoch=self._trainer.epochs_done,
             epochs_total=self._trainer.epochs_total,
-            loss=self._trainer.loss,
+            loss=None if self._trainer.loss is None else min(self._trainer.loss, LARGEST_LOSS),
             sequences=self._sequences,
             round=self._trainer.round,
             corrections=awaited.kept if awaited else 0,
             corrections_total=awaited.most if awaited else 0,
+            damaged=sum(len(store.damaged) for store in self._stores.values()),
             given_up=self._given_up,
             epochs_per_s=self._pace.per_second(),
             policy_version=self._trainer.version,
@@ -206,20 +220,24 @@ class Learner:
         """Start to hand out cases and corrections."""
         keys = self._bus.keys
         self._bus.answer(keys.request_tutoring, TutoringRequest, self._hand_out)
-        self._bus.subscribe(keys.verdict, self._on_verdict, Verdict)
+        self._bus.subscribe_with_sender(keys.verdict, self._on_verdict, Verdict)
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
 
     def _hand_out(self, request: TutoringRequest) -> TutoringCase | Correction | None:
         if self._lifecycle.paused:
+            return None
+        if request.config_digest != self._agreement.digest:
+            self._bus.refuse(f"actor/{request.actor}", OTHER_SETTINGS)
             return None
         case, awaited = self._curriculum.next_case(request.actor), self._round
         if case is not None or awaited is None:
             return case
         return awaited.next_correction(request)
 
-    def _on_verdict(self, verdict: Verdict) -> None:
-        if (awaited := self._round) is not None:
-            awaited.judge(verdict)
+    def _on_verdict(self, verdict: Verdict, sender: Sender) -> None:
+        awaited = self._round
+        if awaited is not None and (problem := awaited.judge(verdict)):
+            self._bus.refuse(str(sender), f"a verdict is ignored: {problem}")
 
     def _on_presence(self, actor: str, alive: bool) -> None:
         if alive:
@@ -229,41 +247,87 @@ class Learner:
             awaited.release(actor)
 
     def _receive(self, inbox: Inbox[Sequence], wait_s: float) -> None:
-        while (sequence := inbox.take(timeout_s=wait_s)) is not None:
-            episode = sequence.episode
-            if self._wants(episode):
-                self._stores[episode.task].add(episode)
-                self._note(episode)
-                LOG.info("stored a %s sequence, %d in all", episode.kind, self._sequences)
-            # A second demonstration of a case is not stored, but gets its receipt as well.
-            receipt = Receipt(episode.id, self._refusal(episode))
-            self._bus.deliver(self._bus.keys.receipt(episode.actor), receipt)
+        while inbox.handle(self._on_sequence, timeout_s=wait_s):
             wait_s = 0.0
 
     def _receive_failures(self, inbox: Inbox[EpisodeFailed]) -> None:
-        while (report := inbox.take()) is not None:
-            if report.kind not in _LEARNED_FROM:  # the evaluator answers it
-                continue
-            awaited = self._round
-            if self._curriculum.fail(report) or (awaited is not None and awaited.fail(report)):
-                self._given_up += 1
-                LOG.warning(
-                    "the %s of %s with the seed %d is given up, its simulation failed %d times: %s",
-                    *(report.kind, report.task, report.seed, TRIES, report.problem),
-                )
-            self._bus.deliver(self._bus.keys.receipt(report.actor), Receipt(report.id))
+        while inbox.handle(self._on_failure):
+            pass
 
-    def _refusal(self, shown: Shown) -> str:
+    def _on_sequence(self, sequence: Sequence) -> None:
+        episode = sequence.episode
+        refusal = self._refusal(episode)
+        if not refusal and self._wants(episode):
+            if self._stores[episode.task].add(episode):
+                self._note(episode)
+                LOG.info("stored a %s sequence, %d in all", episode.kind, self._sequences)
+            else:
+                refusal = "another sequence with this id is stored"
+        if refusal:
+            self._bus.refuse(f"actor/{episode.actor}", refusal)
+        # A second demonstration of a case is not stored, but gets its receipt as well.
+        self._bus.deliver(self._bus.keys.receipt(episode.actor), Receipt(episode.id, refusal))
+
+    def _on_failure(self, report: EpisodeFailed) -> None:
+        if report.kind not in _LEARNED_FROM:  # the evaluator answers it
+            return
+        awaited = self._round
+        if self._curriculum.fail(report) or (awaited is not None and awaited.fail(report)):
+            self._given_up += 1
+            LOG.warning(
+                "the %s of %s with the seed %d is given up, its simulation failed %d times: %s",
+                *(report.kind, report.task, report.seed, TRIES, plain(report.problem)),
+            )
+        self._bus.deliver(self._bus.keys.receipt(report.actor), Receipt(report.id))
+
+    def _refusal(self, episode: Episode) -> str:
         """Why this learner will never store a sequence; empty if it might."""
-        if shown.task not in self._stores:
-            return f"this run learns {' and '.join(self._stores)}, not {shown.task}"
-        if shown.kind is Kind.TUTORING:
-            return self._curriculum.refusal(shown)
-        if shown.kind is not Kind.CORRECTION:
-            return f"nothing is learned from an episode of the kind {shown.kind}"
-        if shown.training != self._run_id:
+        return plain(self._not_asked_for(episode) or self._misfit(episode), 1000 - len("..."))
+
+    def _not_asked_for(self, episode: Episode) -> str:
+        """Why a sequence is none that this learner asks for; empty if it is one."""
+        if episode.task not in self._stores:
+            return f"this run learns {' and '.join(self._stores)}, not {episode.task}"
+        if episode.kind not in _LEARNED_FROM:
+            return f"nothing is learned from an episode of the kind {episode.kind}"
+        if episode.config_digest != self._agreement.digest:
+            return OTHER_SETTINGS
+        if episode.kind is Kind.TUTORING:
+            return self._curriculum.refusal(episode)
+        if episode.training != self._run_id:
             return f"it corrects a policy of another training than {self._run_id}"
         return ""
+
+    def _misfit(self, episode: Episode) -> str:
+        """Why a sequence cannot be the one of its seed; empty if it can."""
+        task = self._tasks[episode.task]
+        if episode.kind is Kind.TUTORING:
+            wanted: Situation | None = task.tutored()[episode.seed // SEEDS_PER_CASE]
+        else:
+            wanted = situation_of_correction(episode.seed, task)
+        if wanted is None or not same_situation(episode.situation, wanted):
+            return f"its situation is not the one of the seed {episode.seed}"
+        return misfit(episode, task, self._config.simulator.control_period_s)
+
+    def _check_stores(self) -> list[EpisodeSummary]:
+        """Set aside all files that nothing can be learned from; what the others show."""
+        found = []
+        for name, store in self._stores.items():
+            for sequence in store.ids:
+                shown = store.summary(sequence)
+                if shown is None:
+                    continue
+                if problem := self._file_problem(shown, name):
+                    store.set_aside(sequence, problem)
+                else:
+                    found.append(shown)
+        return found
+
+    def _file_problem(self, episode: EpisodeSummary, task: str) -> str:
+        """Why a file of the run's folder is no sequence of a task; empty if it is one."""
+        if episode.task != task or episode.kind not in _LEARNED_FROM:
+            return f"it shows {episode.task} in an episode of the kind {episode.kind}"
+        return misfit(episode, self._tasks[task], self._config.simulator.control_period_s)
 
     def _wants(self, shown: Shown) -> bool:
         """Whether the curriculum or the round of corrections lacks this sequence."""
@@ -276,12 +340,12 @@ class Learner:
         if self._round is not None:
             self._round.keep(shown)
 
-    def _make_round(self) -> Round | None:
+    def _make_round(self, *, resumed: bool = False) -> Round | None:
         """The round of corrections that the next epoch has to wait for; None if there is none."""
         if not self._trainer.round_begins:
             return None
         newest = self._run_id, self._trainer.version
-        return Round(self._config, self._trainer.round, newest, self._situations)
+        return Round(self._config, self._trainer.round, newest, self._situations, resumed=resumed)
 
     def _end_round(self) -> None:
         """End the round of corrections. Corrections that arrive later are not stored."""
@@ -317,20 +381,9 @@ class Learner:
         version = self._trainer.version
         if version == 0:
             return
-        path = policy_file(self._folder, version)
-        metadata = load_checkpoint(path).metadata
-        self._bus.publish_newest(
-            self._bus.keys.policy,
-            PolicyVersion(
-                run_id=self._run_id,
-                version=version,
-                epoch=metadata.epoch,
-                loss=metadata.loss or 0.0,
-                config_digest=metadata.config_digest,
-                weights=path.read_bytes(),
-            ),
-        )
-        LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
+        policy = policy_message(policy_file(self._folder, version), self._run_id)
+        self._bus.publish_newest(self._bus.keys.policy, policy)
+        LOG.info("policy %d is published (epoch %d)", version, policy.epoch)
 
 
 def _stores(config: Config) -> Mapping[str, TutoringStore]:

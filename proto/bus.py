@@ -4,8 +4,9 @@ There are two ways to publish. `publish` may lose messages when a reader or a li
 for live data. `deliver` waits for room, but a message in transit is lost when a connection breaks:
 a message that must arrive is kept in an `Outbox` until its receipt comes.
 
-An invalid message is counted, logged once for each sender, and dropped. Callbacks run in Zenoh's
-threads and must return quickly. Zenoh does not survive a fork: start processes with spawn or exec.
+An invalid message, or one that its sender may not send (`proto.senders`), is counted, logged once
+for each sender, and dropped. Callbacks run in Zenoh's threads and must return quickly. Zenoh does
+not survive a fork: start processes with spawn or exec.
 A process ends only when all its buses are closed.
 """
 
@@ -28,6 +29,8 @@ from proto.codec import MessageError, Text, Wire, decode, encode, message, schem
 from proto.config import HubConfig
 from proto.errors import UserError
 from proto.keys import Keys, Role
+from proto.plain_text import plain
+from proto.senders import Sender, is_id, origin_problem
 
 LOG = logging.getLogger(__name__)
 
@@ -100,6 +103,31 @@ class Inbox(Generic[M]):
             except MessageError:
                 continue
         return None
+
+    def handle(self, action: Callable[[M], None], timeout_s: float = 0.0) -> bool:
+        """Take the oldest valid message and call `action` with it.
+
+        An exception in the action is logged and counted as a refusal, and the message is dropped:
+        no message may end a process. A UserError is raised: it is about this machine.
+
+        Args:
+            action: what to do with a message.
+            timeout_s: how long to wait for one.
+
+        Returns:
+            False if none arrived within timeout_s.
+        """
+        message = self.take(timeout_s)
+        if message is None:
+            return False
+        try:
+            action(message)
+        except UserError:
+            raise
+        except Exception:
+            LOG.exception("a %s could not be handled", type(message).__name__)
+            self._bus.refused += 1
+        return True
 
     def put(self, sample: zenoh.Sample) -> None:
         """Add a sample."""
@@ -207,6 +235,18 @@ class Bus:
             self._session.declare_subscriber(key, self._receiver(callback, classes))
         )
 
+    def subscribe_with_sender(
+        self, key: str, callback: Callable[[M, Sender], None], *classes: type[M]
+    ) -> None:
+        """Subscribe to messages that only some may send: the callback gets the sender as well."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            message, sender = self._decode(sample, *classes)
+            if sender is not None:
+                callback(message, sender)
+
+        self._declared.append(self._session.declare_subscriber(key, self._guarded(receive)))
+
     def subscribe_newest(self, key: str, callback: Callable[[M], None], *classes: type[M]) -> None:
         """Subscribe to `publish_newest`: the newest earlier message is received first."""
         self._declared.append(
@@ -269,7 +309,7 @@ class Bus:
                 except MessageError:
                     pass
                 except Exception:
-                    LOG.exception("a question under %s could not be answered", key)
+                    LOG.exception("a question under %s could not be answered", plain(key))
 
         self._declared.append(self._session.declare_queryable(key, on_query))
 
@@ -279,11 +319,12 @@ class Bus:
         self._declared.append(token)
 
     def present(self, role: Role) -> set[str]:
-        """Ids of the living processes of a role."""
+        """Ids of the living processes of a role. A token whose name is no id does not count."""
         replies = self._session.liveliness().get(self.keys.alive(role), timeout=2.0)
-        return {
+        names = (
             str(reply.ok.key_expr).rpartition("/")[2] for reply in replies if reply.ok is not None
-        }
+        )
+        return {name for name in names if is_id(name)}
 
     def watch_presence(self, role: Role, callback: Callable[[str, bool], None]) -> None:
         """Call back with id and True for each living process of a role, with False when it dies.
@@ -293,6 +334,8 @@ class Bus:
 
         def on_change(sample: zenoh.Sample) -> None:
             process = str(sample.key_expr).rpartition("/")[2]
+            if not is_id(process):
+                return
             try:
                 callback(process, sample.kind == zenoh.SampleKind.PUT)
             except Exception:
@@ -310,17 +353,44 @@ class Bus:
         Raises:
             MessageError: it is invalid; it has been counted and logged.
         """
-        sender = str(received.key_expr)
+        return self._decode(received, *classes)[0]
+
+    def refuse(self, sender: str, problem: object) -> None:
+        """Count a message as refused, and say why once for each sender.
+
+        Args:
+            sender: who sent it; a text from outside.
+            problem: what is wrong with it; its text may come from outside.
+        """
+        self.refused += 1
+        if sender in self._complained_about or len(self._complained_about) >= _SENDERS_REMEMBERED:
+            return
+        self._complained_about.add(sender)
+        LOG.warning(
+            "refused a message of %s: %s (logged once for each sender)",
+            plain(sender, 300),
+            plain(problem, 1000),
+        )
+
+    def _decode(
+        self, received: zenoh.Sample | zenoh.Query, *classes: type[M]
+    ) -> tuple[M, Sender | None]:
+        """Decode what was received; the message, and its sender if the attachment names one."""
+        key = str(received.key_expr)
+        name, sender = key, None
         payload = b"" if received.payload is None else received.payload.to_bytes()
         try:
             if received.attachment is not None:
                 attachment = Attachment.read(received.attachment.to_bytes())
-                sender = f"{attachment.sender} ({sender})"
+                name, sender = f"{attachment.sender} ({key})", Sender.parse(attachment.sender)
                 attachment.check(payload)
-            return decode(Wire(str(received.encoding), payload), *classes)
+            message = decode(Wire(str(received.encoding), payload), *classes)
+            if problem := origin_problem(message, key, sender):
+                raise MessageError("sender", problem)
         except MessageError as error:
-            self._refuse(sender, error)
+            self.refuse(name, error)
             raise
+        return message, sender
 
     def _put(self, key: str, wire: Wire, congestion: zenoh.CongestionControl) -> None:
         self._session.put(
@@ -337,22 +407,20 @@ class Bus:
     def _receiver(
         self, callback: Callable[[M], None], classes: tuple[type[M], ...]
     ) -> Callable[[zenoh.Sample], None]:
+        return self._guarded(lambda sample: callback(self.decode(sample, *classes)))
+
+    def _guarded(self, receive: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
+        """Call `receive`, and let no exception out into Zenoh's thread."""
+
         def on_sample(sample: zenoh.Sample) -> None:
             try:
-                callback(self.decode(sample, *classes))
+                receive(sample)
             except MessageError:
                 pass
             except Exception:
-                LOG.exception("a message under %s could not be handled", sample.key_expr)
+                LOG.exception("a message under %s could not be handled", plain(sample.key_expr))
 
         return on_sample
-
-    def _refuse(self, sender: str, error: MessageError) -> None:
-        self.refused += 1
-        if sender in self._complained_about or len(self._complained_about) >= _SENDERS_REMEMBERED:
-            return
-        self._complained_about.add(sender)
-        LOG.warning("refused a message of %s: %s (logged once for each sender)", sender, error)
 
 
 def open_bus(config: HubConfig, run: str, role: Role, process: str) -> Bus:

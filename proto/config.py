@@ -21,6 +21,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails
 
+from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.errors import UserError
 from proto.seeds import SEEDS_PER_CASE, TRIALS_BELOW
 from proto.storage import written_whole
@@ -30,10 +31,20 @@ from proto.strict_yaml import WrittenFloat, WrittenInt, dump_yaml, load_yaml
 Switch = Annotated[bool, Field(strict=True)]
 Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
-TimeConstant = Annotated[float, Field(strict=True, ge=1)]
+TimeConstant = Annotated[float, Field(strict=True, ge=1, le=1e6, allow_inf_nan=False)]
 Natural = Annotated[int, Field(strict=True, ge=0)]
 Count = Annotated[int, Field(strict=True, ge=1)]
-AtLeastTwo = Annotated[int, Field(strict=True, ge=2)]
+# Limits of the sizes of a network. The compiled kernels take any size that is within them; together
+# with the limits in `learner.network.subnets` they keep a network from taking all memory.
+Units = Annotated[int, Field(strict=True, ge=1, le=4096)]
+Maps = Annotated[int, Field(strict=True, ge=1, le=256)]
+KernelWidth = Annotated[int, Field(strict=True, ge=1, le=IMAGE_WIDTH)]
+KernelHeight = Annotated[int, Field(strict=True, ge=1, le=IMAGE_HEIGHT)]
+Stride = Annotated[int, Field(strict=True, ge=1, le=IMAGE_WIDTH)]
+# The outputs of all values together must fit into an episode, which holds at most 4096 of them.
+SoftmaxUnits = Annotated[int, Field(strict=True, ge=2, le=256)]
+CodeMargin = Annotated[float, Field(strict=True, ge=0, le=100, allow_inf_nan=False)]
+CodeWidth = Annotated[float, Field(strict=True, ge=1e-3, le=100, allow_inf_nan=False)]
 
 
 def _check_repeats(repeats: int) -> int:
@@ -195,7 +206,7 @@ class TutorConfig(_Section):
 class SubnetConfig(_Section):
     """A fully connected subnet of leaky integrators (PFC, M_S, M_F)."""
 
-    units: Count
+    units: Units
     tau: TimeConstant
 
 
@@ -209,9 +220,9 @@ class MapsConfig(_Section):
         tau: time constant (control steps).
     """
 
-    maps: Count
-    kernel: tuple[Count, Count]
-    stride: Count
+    maps: Maps
+    kernel: tuple[KernelWidth, KernelHeight]
+    stride: Stride
     tau: TimeConstant
 
 
@@ -223,9 +234,9 @@ class NetworkConfig(_Section):
     pfc: SubnetConfig = SubnetConfig(units=20, tau=150)
     mtrnn_slow: SubnetConfig = SubnetConfig(units=30, tau=10)
     mtrnn_fast: SubnetConfig = SubnetConfig(units=50, tau=2)
-    softmax_units: AtLeastTwo = 10
-    code_margin: NotNegative = 0.2
-    code_width: Positive = 0.6
+    softmax_units: SoftmaxUnits = 10
+    code_margin: CodeMargin = 0.2
+    code_width: CodeWidth = 0.6
     update_order: Literal["bottom_up", "literal"] = "bottom_up"
 
     @model_validator(mode="before")
@@ -349,7 +360,7 @@ class RivalConfig(_Section):
             pre-training.
     """
 
-    units: Count
+    units: Units
     together_epochs: Count = 60
     epochs: Count = 600
     rate: Positive = 3e-3
@@ -361,13 +372,13 @@ class RivalConfig(_Section):
 class CnnLstmConfig(RivalConfig):
     """A small CNN with an LSTM."""
 
-    units: Count = 44
+    units: Units = 44
 
 
 class FeedForwardConfig(RivalConfig):
     """A small CNN with a hidden layer, which uses the current picture only."""
 
-    units: Count = 128
+    units: Units = 128
 
 
 class ComparisonConfig(_Section):

@@ -52,6 +52,11 @@ class Keys:
         return f"vmdnn/{self.run}/request/trial"
 
     @property
+    def settings(self) -> str:
+        """A process that joins asks learner and evaluator: `Settings`, answered by `Settings`."""
+        return f"vmdnn/{self.run}/settings"
+
+    @property
     def verdict(self) -> str:
         """Evaluator to learner: `Verdict`."""
         return f"vmdnn/{self.run}/verdict"

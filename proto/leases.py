@@ -40,6 +40,13 @@ class Leases(Generic[Item]):
                 self._leases[item] = _Lease(holder, self._clock() + self._lease_s)
             return item
 
+    def holder(self, item: Item) -> str | None:
+        """Return who holds an item; None if nobody does."""
+        with self._lock:
+            self._drop(lambda lease: lease.until_s <= self._clock())
+            lease = self._leases.get(item)
+            return None if lease is None else lease.holder
+
     def finish(self, item: Item) -> None:
         """End the lease of an item, because it is done or has failed."""
         with self._lock:

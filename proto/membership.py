@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +14,8 @@ from proto.lifecycle import Lifecycle
 from proto.messages import Command, Control, ControlReply
 from proto.metrics import Metrics
 from proto.periodic import every
+
+LOG = logging.getLogger(__name__)
 
 METRICS_PERIOD_S: Final = 1.0
 FROZEN_S: Final = 12.0
@@ -43,7 +46,10 @@ def membership(bus: Bus, participant: Participant, lifecycle: Lifecycle) -> Iter
     bus.announce()
     with every(METRICS_PERIOD_S, publish_metrics):
         yield
-    publish_metrics()  # the final state
+    try:
+        publish_metrics()  # the final state
+    except Exception:
+        LOG.exception("the last metrics could not be published")
 
 
 def alone_in_run(bus: Bus, lifecycle: Lifecycle, *, patience_s: float = FROZEN_S) -> None:

@@ -7,7 +7,18 @@ from enum import StrEnum
 from typing import Annotated, Final
 
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
-from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Text, message
+from proto.codec import (
+    MEBIBYTE,
+    Array,
+    Blob,
+    Integer,
+    Many,
+    Number,
+    Size,
+    Text,
+    message,
+    record_of,
+)
 from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind, Outcome
 from proto.keys import Role
 from proto.seeds import SEEDS_PER_CASE
@@ -17,7 +28,11 @@ EPISODE_LIMIT: Final = 32 * MEBIBYTE
 POLICY_LIMIT: Final = 256 * MEBIBYTE
 
 Count = Annotated[int, Integer(0, 2**31)]
+LARGEST_VERSION: Final = 10**6
+"""Largest version of a policy. Each version takes an epoch of training at least."""
 Seed = Annotated[int, Integer(0, 2**63 - 1)]
+
+LARGEST_LOSS: Final = 1e9
 
 PolicyKey = tuple[str, int]
 """Identifies a policy: id of its training, and its version."""
@@ -30,7 +45,7 @@ class PolicyVersion:
 
     Attributes:
         run_id: id of the training; a training that starts without a checkpoint has a new id.
-        version: 1, 2, ... within a training; it only increases.
+        version: 1, 2, ... within a training; it only increases, and never exceeds the epoch.
         epoch: epoch of the coupled training after which it was published.
         loss: training loss at that epoch.
         config_digest: digest of the learner's configuration.
@@ -38,11 +53,16 @@ class PolicyVersion:
     """
 
     run_id: Id
-    version: Annotated[int, Integer(1, 2**31)]
+    version: Annotated[int, Integer(1, LARGEST_VERSION)]
     epoch: Count
-    loss: Annotated[float, Number(0.0, 1e9)]
+    loss: Annotated[float, Number(0.0, LARGEST_LOSS)]
     config_digest: str
     weights: Annotated[bytes, Blob(POLICY_LIMIT)]
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if there are more versions than epochs."""
+        if self.version > self.epoch:
+            raise ValueError(f"version {self.version} cannot come after {self.epoch} epochs")
 
 
 @message("sequence", 4, limit=EPISODE_LIMIT)
@@ -113,7 +133,7 @@ class Receipt:
     refusal: Annotated[str, Text(1000)] = ""
 
 
-@message("tutoring_request", 2)
+@message("tutoring_request", 3)
 @dataclass(frozen=True)
 class TutoringRequest:
     """An actor's request for a `TutoringCase` or a `Correction`.
@@ -122,11 +142,13 @@ class TutoringRequest:
         actor: id of the actor.
         run_id: id of the training that its policy comes from, empty if it has no policy.
         policy_version: version of its policy, 0 if it has none.
+        config_digest: digest of the actor's settings, see `proto.agreement`.
     """
 
     actor: Id
     run_id: Annotated[str, Text(64)]
     policy_version: Count
+    config_digest: Annotated[str, Text(64)]
 
 
 @message("tutoring_case", 2)
@@ -188,7 +210,7 @@ class Verdict:
     outcome: Outcome
 
 
-@message("trial_request", 1)
+@message("trial_request", 2)
 @dataclass(frozen=True)
 class TrialRequest:
     """An actor's request for a trial of its policy; fields as in `TutoringRequest`."""
@@ -196,6 +218,7 @@ class TrialRequest:
     actor: Id
     run_id: Id
     policy_version: Count
+    config_digest: Annotated[str, Text(64)]
 
 
 @message("trial", 1)
@@ -208,6 +231,37 @@ class Trial:
     """
 
     seed: Seed
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A value of a configuration that must be the same in all processes of a run.
+
+    Attributes:
+        key: such as `network.pfc.tau`.
+        value: the value as JSON.
+    """
+
+    key: Annotated[str, Text(256)]
+    value: Annotated[str, Text(1000)]
+
+
+@message("settings", 1, form="json", limit=MEBIBYTE)
+@dataclass(frozen=True)
+class Settings:
+    """What must agree in the configuration of a process, see `proto.agreement`.
+
+    Question and answer are the same message: a process that joins sends its own.
+
+    Attributes:
+        role: role of the process.
+        id: id of the process.
+        values: the values, sorted by key.
+    """
+
+    role: Role
+    id: Id
+    values: Annotated[tuple[Setting, ...], Many(record_of(Setting), Size("values", 0, 1000))]
 
 
 @message("live", 3)

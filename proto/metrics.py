@@ -87,7 +87,7 @@ class Stage(StrEnum):
     FINISHED = "finished"
 
 
-@message("metrics.learner", 3, form="json")
+@message("metrics.learner", 4, form="json")
 @dataclass(frozen=True, kw_only=True)
 class LearnerMetrics(Metrics):
     """Metrics of the learner.
@@ -102,6 +102,8 @@ class LearnerMetrics(Metrics):
         corrections: stored corrections of this round; 0 unless the stage is `waiting`.
         corrections_total: largest number of corrections of this round; 0 unless the stage is
             `waiting`.
+        damaged: sequences, policies and checkpoints that could not be read since the process
+            started; see its log.
         given_up: tutored cases and corrections that are no longer requested, because their
             simulation failed repeatedly; counted since the process started.
         epochs_per_s: epochs per second since the last metrics.
@@ -119,6 +121,7 @@ class LearnerMetrics(Metrics):
     round: Count
     corrections: Count
     corrections_total: Count
+    damaged: Count
     given_up: Count
     epochs_per_s: Rate
     policy_version: Count

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from proto.bus import Bus
 from proto.codec import encode
@@ -15,6 +15,8 @@ from proto.keys import Role
 from proto.metrics import METRICS, EvaluatorMetrics, LearnerMetrics, Metrics, PolicyScore
 
 M = TypeVar("M", bound=Metrics)
+PROCESSES_KEPT: Final = 10_000
+"""A board keeps the metrics of so many processes."""
 ProcessKey = tuple[Role, str]
 """Role and id."""
 
@@ -79,9 +81,14 @@ class Board:
         bus.subscribe(bus.keys.metrics(), self._keep, *METRICS)
 
     def view(self) -> RunView:
-        """What is known at this moment."""
+        """What is known at this moment of all processes that are or were present.
+
+        Metrics of a process that never was present are left out: anybody could send them.
+        """
         with self._changed:
-            return RunView(self._run, dict(self._metrics), dict(self._vanished_s))
+            known = self._present | self._vanished_s.keys()
+            metrics = {process: m for process, m in self._metrics.items() if process in known}
+            return RunView(self._run, metrics, dict(self._vanished_s))
 
     def wait_for_all(self, timeout_s: float) -> RunView:
         """Wait until every living process has published metrics, or the time is up.
@@ -96,8 +103,11 @@ class Board:
         return bool(self._present) and self._present <= self._metrics.keys()
 
     def _keep(self, metrics: Metrics) -> None:
+        process = (metrics.role, metrics.id)
         with self._changed:
-            self._metrics[metrics.role, metrics.id] = metrics
+            if process not in self._metrics and len(self._metrics) >= PROCESSES_KEPT:
+                return
+            self._metrics[process] = metrics
             self._changed.notify_all()
 
     def _presence_of(self, role: Role) -> Callable[[str, bool], None]:

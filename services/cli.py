@@ -11,6 +11,7 @@ from importlib.metadata import version
 from typing import Final, Protocol, cast
 
 from proto.errors import UserError
+from proto.plain_text import plain_lines
 
 
 class Subcommand(Protocol):
@@ -81,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return int(arguments.run(arguments))
     except UserError as error:
-        print(f"vmdnn {arguments.command}: {error}", file=sys.stderr)
+        print(f"vmdnn {arguments.command}: {plain_lines(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130

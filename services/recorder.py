@@ -10,6 +10,7 @@ import logging
 import time
 from typing import Final
 
+from proto.agreement import OTHER_SETTINGS, digest_of, settings_of
 from proto.bus import Bus, Inbox
 from proto.config import Config
 from proto.episode import Episode, Kind
@@ -35,6 +36,8 @@ class Recorder:
         """Start to collect rollouts."""
         self._folder = config.run_folder / "rollouts"
         self._practice = config.recorder.practice
+        self._task = config.task.name
+        self._digest = digest_of(settings_of(config))
         self._bus = bus
         self._lifecycle = lifecycle
         self._inbox: Inbox[Rollout] = bus.inbox(bus.keys.rollout(), Rollout, capacity=WAITING)
@@ -67,7 +70,11 @@ class Recorder:
         return f"{self._episodes} rollouts are in {self._folder}"
 
     def _is_recorded(self, episode: Episode) -> bool:
-        return self._practice or episode.kind is Kind.TRIAL
+        """Whether an episode is a rollout of this run that is to be recorded."""
+        if episode.task != self._task or episode.config_digest != self._digest:
+            self._bus.refuse(f"actor/{episode.actor}", OTHER_SETTINGS)
+            return False
+        return episode.kind is Kind.TRIAL or (self._practice and episode.kind is Kind.PRACTICE)
 
     def _record(self, episode: Episode) -> None:
         path = self._folder / f"{episode.id}.mcap"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ from learner.kernels.library import acting_library
 Floats = NDArray[np.float32]
 
 _LEVELS: Final = 3
+_LARGEST: Final = 2**15
+"""Of each size: products of two of them are integers of the library."""
 
 
 class _MapsShape(ctypes.Structure):
@@ -150,7 +153,13 @@ def available() -> bool:
 
 
 def _make(library: ctypes.PyDLL, sizes: NetworkSizes, parameters: Sequence[Floats]) -> int:
-    """A new network of the library."""
+    """A new network of the library.
+
+    Raises:
+        ValueError: the sizes are not those of a network, or the parameters do not have them.
+        MemoryError: there is not enough memory.
+    """
+    _check(sizes)
     flat = np.concatenate([np.asarray(each, np.float32).reshape(-1) for each in parameters])
     if len(flat) != _parameter_count(sizes):  # the library follows the sizes without checking them
         raise ValueError(f"there are {len(flat)} parameters, not {_parameter_count(sizes)}")
@@ -169,6 +178,30 @@ def _make(library: ctypes.PyDLL, sizes: NetworkSizes, parameters: Sequence[Float
     if network is None:
         raise MemoryError("there is no memory for the network")
     return network
+
+
+def _check(sizes: NetworkSizes) -> None:
+    """The library follows the sizes without checking them."""
+    below = sizes.image
+    for maps in sizes.maps:
+        kernel = (maps.kernel_height, maps.kernel_width)
+        counts = (maps.maps, maps.stride, *kernel, *below)
+        if not all(1 <= count <= _LARGEST for count in counts):
+            raise ValueError(f"{maps} has a size that is not in 1..{_LARGEST}")
+        rows_and_columns = tuple(
+            (size - taps) // maps.stride + 1 for size, taps in zip(below, kernel, strict=True)
+        )
+        if min(rows_and_columns) < 1 or rows_and_columns != (maps.height, maps.width):
+            raise ValueError(f"{maps} does not fit what it sees, which is {below}")
+        below = (maps.height, maps.width)
+    widths = (*(level.units for level in sizes.levels), sizes.values, sizes.softmax_units)
+    if not all(1 <= width <= _LARGEST for width in widths):
+        raise ValueError(f"{sizes} has a size that is not in 1..{_LARGEST}")
+    taus = [each.tau for each in (*sizes.maps, *sizes.levels)]
+    if not all(1 <= tau < math.inf for tau in taus):
+        raise ValueError(f"the time constants {taus} are not all finite and at least 1")
+    if _parameter_count(sizes) >= 2**31:
+        raise ValueError(f"{_parameter_count(sizes)} parameters are too many")
 
 
 def _maps_shape(maps: MapsSizes) -> _MapsShape:

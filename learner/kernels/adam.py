@@ -49,8 +49,15 @@ def step(arrays: AdamArrays, *, number: int, rate: float, max_norm: float) -> No
         number: number of the step, from 1 on.
         rate: learning rate.
         max_norm: a gradient with a larger norm is scaled down to it; may be infinite.
+
+    Raises:
+        ValueError: the arrays differ in size or type, or one is not contiguous.
     """
     weights = arrays.weights
+    for array in vars(arrays).values():  # the kernel follows the size without checking it
+        fits = array.shape == weights.shape and array.dtype == weights.dtype
+        if not fits or array.dim() != 1 or not array.is_contiguous():
+            raise ValueError(f"an array of Adam is {tuple(array.shape)} {array.dtype}")
     _KERNEL(
         weights.dtype,
         len(weights),

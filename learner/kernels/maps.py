@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import ctypes
+import math
 from typing import Any, Final, cast
 
 import torch
@@ -58,6 +59,16 @@ def maps(below: Tensor, kernel: Tensor, bias: Tensor, stride: int, tau: float) -
     """
     if below.dim() != 5 or below.shape[2] != kernel.shape[1]:
         raise ValueError(f"below is {tuple(below.shape)}, but the kernel {tuple(kernel.shape)}")
+    if len(bias) != len(kernel):
+        raise ValueError(f"there are {len(bias)} biases for {len(kernel)} maps")
+    rows, columns = (
+        size - taps for size, taps in zip(below.shape[3:], kernel.shape[2:], strict=True)
+    )
+    if stride < 1 or min(rows, columns) < 0 or not 1 <= tau < math.inf:
+        raise ValueError(
+            f"a kernel {tuple(kernel.shape)} with the stride {stride} and the time constant {tau}"
+            f" does not fit below, which is {tuple(below.shape)}"
+        )
     if not below.dtype == kernel.dtype == bias.dtype:
         raise ValueError(f"below is {below.dtype}, but the kernel {kernel.dtype}")
     result = _Maps.apply(below, kernel, bias, stride, tau)  # type: ignore[no-untyped-call]

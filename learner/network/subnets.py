@@ -6,7 +6,7 @@ act (`learner.network.acting`) and `vmdnn inspect network` use them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import Final
@@ -21,6 +21,11 @@ from proto.errors import UserError
 ACTIVATION_GAIN: Final = 1.7159
 ACTIVATION_SLOPE: Final = 2 / 3
 """f(x) = 1.7159 tanh(2/3 x), eq. (2): activation of all units but those of V_I and M_O."""
+
+LARGEST_SUBNET: Final = 65_536
+"""Units of a subnet; an episode with recorded states holds no more."""
+LARGEST_NETWORK: Final = 2**25
+"""Parameters of a network: 128 MiB."""
 
 Shape = tuple[int, ...]
 Array = NDArray[np.floating]
@@ -66,7 +71,7 @@ def subnets(config: NetworkConfig) -> dict[str, Subnet]:
     """All subnets by name, from the vision input up to the PFC and down to the outputs.
 
     Raises:
-        UserError: a kernel is larger than what it looks at.
+        UserError: a kernel is larger than what it looks at, or the network is too large.
     """
     vision = Subnet("vision_input", "V_I", (1, IMAGE_HEIGHT, IMAGE_WIDTH), 1.0, None, None, {})
     fast = _maps("mstnn_fast", "V_F", vision, config.mstnn_fast)
@@ -106,6 +111,7 @@ def subnets(config: NetworkConfig) -> dict[str, Subnet]:
         ),
         _outputs(config.softmax_units, mtrnn_fast.units),
     )
+    _check_sizes(chain)
     return {subnet.name: subnet for subnet in chain}
 
 
@@ -116,6 +122,21 @@ def parameter_shapes(config: NetworkConfig) -> dict[str, Shape]:
         for subnet in subnets(config).values()
         for parameter, shape in subnet.parameters.items()
     }
+
+
+def _check_sizes(chain: Sequence[Subnet]) -> None:
+    for subnet in chain:
+        if prod(subnet.shape) > LARGEST_SUBNET:
+            raise UserError(
+                f"network.{subnet.name} has {prod(subnet.shape)} units; at most {LARGEST_SUBNET}"
+                " are possible: choose fewer maps, or a larger kernel or stride"
+            )
+    parameters = sum(subnet.weights + subnet.biases for subnet in chain)
+    if parameters > LARGEST_NETWORK:
+        raise UserError(
+            f"the network has {parameters} parameters; at most {LARGEST_NETWORK} are possible:"
+            " choose fewer maps or units"
+        )
 
 
 def _maps(name: str, symbol: str, below: Subnet, config: MapsConfig) -> Subnet:

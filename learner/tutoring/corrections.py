@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Sequence
 from typing import Protocol
 
 from learner.tutoring.failures import Failures, Shown
+from proto.acceptance import PlayedTask, same_situation
 from proto.config import Config
 from proto.episode import Kind
 from proto.leases import Leases
 from proto.messages import Correction, EpisodeFailed, PolicyKey, TutoringRequest, Verdict
-from proto.seeds import CORRECTIONS
+from proto.seeds import CORRECTIONS, PRACTICE, TRIALS_BELOW
 from proto.variables import Question, Situation
 
 
-class Situations(Protocol):
+class Situations(PlayedTask, Protocol):
     """What the learner must know of a task.
 
     Attributes:
@@ -26,12 +26,6 @@ class Situations(Protocol):
 
     questions: tuple[Question, ...]
     distractors: frozenset[str]
-
-    def tutored(self) -> Sequence[Situation]:
-        """The tutored situations, always in the same order."""
-
-    def sample(self, seed: int) -> Situation:
-        """A random situation; the same seed gives the same one."""
 
 
 class Round:
@@ -47,7 +41,13 @@ class Round:
     """
 
     def __init__(
-        self, config: Config, number: int, policy: PolicyKey, situations: Situations
+        self,
+        config: Config,
+        number: int,
+        policy: PolicyKey,
+        situations: Situations,
+        *,
+        resumed: bool = False,
     ) -> None:
         """Plan a round.
 
@@ -56,11 +56,15 @@ class Round:
             number: number of the round, from 1.
             policy: the newest policy, which is guided.
             situations: situations of the configuration's task.
+            resumed: whether a former process began the round. It may have asked for corrections of
+                failures that this process does not know of; they are accepted as well.
         """
         corrections = config.learner.corrections
         self.number = number
         self._task = config.task.name
         self._policy = policy
+        self._situations = situations
+        self._asked_before = resumed and corrections.choose == "failures"
         self._tries = corrections.tries if corrections.choose == "failures" else 0
         planned = _chosen(config, number, situations)
         self.most = len(planned) or corrections.sequences
@@ -88,17 +92,26 @@ class Round:
         with self._lock:
             return not self._missing and not self._searching
 
-    def judge(self, verdict: Verdict) -> None:
-        """Note how an episode of practice ended; a failure becomes a correction to ask for."""
+    def judge(self, verdict: Verdict) -> str:
+        """Note how an episode of practice ended; a failure becomes a correction to ask for.
+
+        Returns:
+            Why the verdict is ignored because it cannot be true; empty otherwise.
+        """
         with self._lock:
             ours = (verdict.run_id, verdict.policy_version) == self._policy
             if not ours or verdict.task != self._task or not self._searching:
-                return
+                return ""
+            if verdict.seed not in PRACTICE:
+                return f"its seed {verdict.seed} is none of practice"
+            if not same_situation(verdict.situation, self._situations.sample(verdict.seed)):
+                return f"its situation is not the one of the seed {verdict.seed}"
             self._judged.add(verdict.seed)
             done = self._kept | self._given_up
             if not verdict.outcome.precise and verdict.seed not in done:
                 plan = Correction(verdict.task, verdict.seed, verdict.situation)
                 self._missing[verdict.seed] = plan
+            return ""
 
     def next_correction(self, request: TutoringRequest) -> Correction | None:
         """A situation for an actor; None if none is left, or if the actor has another policy."""
@@ -128,10 +141,13 @@ class Round:
     def fail(self, report: EpisodeFailed) -> bool:
         """Note that the simulation of a correction failed; whether it is given up for that.
 
-        Otherwise it is handed out again.
+        Otherwise it is handed out again. The report of an actor that does not play it at present
+        is ignored.
         """
         with self._lock:
             if not self._is_of_policy(report) or report.seed not in self._missing:
+                return False
+            if self._leases.holder(report.seed) != report.actor:
                 return False
             self._leases.finish(report.seed)
             if not self._failures.add(report.seed, report.id):
@@ -144,8 +160,10 @@ class Round:
         return (
             self._is_of_policy(shown)
             and shown.seed not in self._kept
-            # a correction that was asked for before a restart is accepted as well
-            and (shown.seed in self._missing or not self._full)
+            and (
+                shown.seed in self._missing
+                or (self._asked_before and shown.seed in PRACTICE and not self._full)
+            )
         )
 
     def _is_of_policy(self, shown: Shown) -> bool:
@@ -162,6 +180,14 @@ class Round:
     @property
     def _searching(self) -> bool:
         return len(self._judged) < self._tries and not self._full
+
+
+def situation_of_correction(seed: int, situations: Situations) -> Situation | None:
+    """The situation that a seed of a correction stands for; None if it is the seed of none."""
+    if seed in CORRECTIONS or seed in PRACTICE:
+        return situations.sample(seed)
+    tutored = situations.tutored() if seed < TRIALS_BELOW else ()
+    return tutored[seed] if seed < len(tutored) else None
 
 
 def _chosen(config: Config, number: int, situations: Situations) -> list[Correction]:

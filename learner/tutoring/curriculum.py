@@ -87,12 +87,15 @@ class Curriculum:
     def fail(self, report: EpisodeFailed) -> bool:
         """Note that the simulation of a case failed; whether the case is given up for that.
 
-        Otherwise it is handed out again.
+        Otherwise it is handed out again. The report of an actor that does not play the case at
+        present is ignored.
         """
         with self._lock:
             if not self._lacks(report):
                 return False
             key = _key(report)
+            if self._leases.holder(self._missing[key]) != report.actor:
+                return False
             self._leases.finish(self._missing[key])
             if not self._failures.add(key, report.id):
                 return False

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from threading import Lock
 from typing import TypeVar
 
 from proto.episode import Episode
 from proto.errors import UserError
+from proto.plain_text import plain
 from proto.recordings.episodes import (
     EpisodeSummary,
     read_episode,
     read_summary,
     write_episode,
 )
+from proto.storage import change_suffix
 
 LOG = logging.getLogger(__name__)
 
@@ -30,7 +32,7 @@ class TutoringStore:
 
     Attributes:
         folder: where the files are; it is made for the first one.
-        damaged: what is wrong with each file that could not be read, by id.
+        damaged: what is wrong with each file that could not be read or was set aside, by id.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -66,22 +68,36 @@ class TutoringStore:
         """Read an episode by its id; None if its file is missing or damaged."""
         return self._read(sequence, read_episode)
 
-    def summaries(self) -> Iterator[EpisodeSummary]:
-        """What each sequence is, without its steps; missing and damaged files are left out."""
-        for sequence in self.ids:
-            summary = self._read(sequence, read_summary)
-            if summary is not None:
-                yield summary
+    def summary(self, sequence: str) -> EpisodeSummary | None:
+        """What a sequence is, without its pictures; None if its file is missing or damaged."""
+        return self._read(sequence, read_summary)
 
     def _read(self, sequence: str, read: Callable[[Path], Read]) -> Read | None:
         try:
             return read(self._path(sequence))
         except UserError as error:
-            LOG.warning("tutored sequence ignored: %s", error)
+            LOG.warning("tutored sequence ignored: %s", plain(error))
             with self._lock:
                 self._ids.discard(sequence)
                 self.damaged[sequence] = str(error)
             return None
+
+    def set_aside(self, sequence: str, problem: str) -> None:
+        """Keep a file out of the store under the suffix `.refused`, and say why.
+
+        Args:
+            sequence: id of the sequence.
+            problem: what is wrong with it.
+        """
+        path = self._path(sequence)
+        with self._lock:
+            self._ids.discard(sequence)
+            self.damaged[sequence] = problem
+        try:
+            kept = f"it is kept as {change_suffix(path, '.refused')}"
+        except UserError as error:
+            kept = f"it cannot be renamed: {error}"
+        LOG.warning("nothing is learned from %s: %s; %s", path, plain(problem), kept)
 
     def _path(self, sequence: str) -> Path:
         return self.folder / f"{sequence}.mcap"

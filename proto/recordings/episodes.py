@@ -55,6 +55,7 @@ from proto.recordings.schemas import (
     describe,
 )
 from proto.storage import written_whole
+from proto.variables import Situation
 
 FORMAT: Final = 3
 """Format of the files that are written; files of formats 1 and 2 can be read too."""
@@ -169,18 +170,23 @@ def _check_steps(path: Path, steps: int, expected: int) -> None:
 
 @dataclass(frozen=True)
 class EpisodeSummary:
-    """The fields that identify a recorded episode; see `Episode`."""
+    """The fields of a recorded episode that tell whether a run can use it; see `Episode`."""
 
     id: str
     kind: Kind
     task: str
+    situation: Situation
     seed: int
     policy_version: int
     training: str
+    control_period_s: float
+    phases: NDArray[np.uint8]
+    actions: Floats
+    targets: Floats
 
 
 def read_summary(path: Path) -> EpisodeSummary:
-    """Read the summary of an episode; check the whole file, but do not decode its steps.
+    """Read the summary of an episode; check the whole file, but do not decode its pictures.
 
     Raises:
         UserError: as `read_episode`.
@@ -188,18 +194,24 @@ def read_summary(path: Path) -> EpisodeSummary:
     contents = _contents(path)
     try:
         texts = contents.metadata["episode"]
-        summary = EpisodeSummary(
+        steps = [Step.FromString(data) for data in contents.messages[STEP]]
+        _check_steps(path, len(steps), int(texts["steps"]))
+        shape = (len(steps), len(ACTION_NAMES))
+        return EpisodeSummary(
             id=texts["id"],
             kind=Kind(texts["kind"]),
             task=texts["task"],
+            situation={k: json.loads(v) for k, v in contents.metadata["situation"].items()},
             seed=int(texts["seed"]),
             policy_version=int(texts["policy_version"]),
             training=texts.get("training", ""),
+            control_period_s=float(texts["control_period_s"]),
+            phases=np.array([step.phase - 1 for step in steps], dtype=np.uint8),
+            actions=_floats([_action(step.action) for step in steps], shape),
+            targets=_floats([_action(step.target) for step in steps], shape),
         )
-        _check_steps(path, len(contents.messages[STEP]), int(texts["steps"]))
-    except (KeyError, ValueError) as error:
+    except (KeyError, ValueError, TypeError, AttributeError, DecodeError) as error:
         raise _not_an_episode(path, error) from error
-    return summary
 
 
 def records(path: Path) -> Iterator[McapRecord]:

@@ -13,6 +13,7 @@ from typing import Final
 
 from proto.config import Config, load_config
 from proto.errors import UserError
+from proto.plain_text import plain_lines
 
 LARGEST_SEED: Final = 2**32 - 1
 
@@ -90,9 +91,19 @@ def config_of(arguments: argparse.Namespace) -> Config:
 
 def start_logging(role: str) -> None:
     """Log to standard error; each line has the time and the role."""
-    logging.basicConfig(
-        level=logging.INFO, format=f"%(asctime)s {role} %(levelname)s %(message)s", force=True
-    )
+    handler = logging.StreamHandler()
+    handler.setFormatter(_PlainFormatter(f"%(asctime)s {role} %(levelname)s %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+
+
+class _PlainFormatter(logging.Formatter):
+    """Writes each record so that no text in it can look like another record.
+
+    The further lines of a message and of a stack trace are indented.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        return "\n    ".join(plain_lines(super().format(record)).split("\n"))
 
 
 def _id(text: str) -> str:

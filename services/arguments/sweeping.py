@@ -6,11 +6,10 @@ import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from learner.tutoring.store import TutoringStore
 from services.arguments.common import positive, seed
 from services.arguments.training import interruption
+from services.terminal.console import make_console
 from services.terminal.progress import progress_bar
 from services.trials import sweeps
 from services.trials.success import READINGS, Tally
@@ -54,7 +53,7 @@ def run_sweep(
         KeyboardInterrupt: Ctrl-C was pressed; the results so far are in the folder.
     """
     runs = sweeps.open_runs(variants, arguments.seeds, work)
-    console = Console(stderr=True)
+    console = make_console(stderr=True)
     tested = []
     try:
         for number, run in enumerate(runs, 1):

@@ -7,13 +7,12 @@ import json
 from contextlib import closing
 from pathlib import Path
 
-from rich.console import Console
-
 from learner.tutoring.store import TutoringStore
 from proto.config import Config
 from services.arguments.common import add_config, add_playing, playing_config
 from services.arguments.sweeping import Stores, add_sweep, run_sweep
 from services.arguments.training import add_training_data, training_stores
+from services.terminal.console import make_console
 from services.terminal.progress import progress_bar
 from services.trials import comparison
 from services.trials.comparison import CONTENDERS, FIXED_GAZE
@@ -58,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(comparison.numbers(scores)))
     else:
-        Console().print(comparison.table(scores))
+        make_console().print(comparison.table(scores))
     return 0
 
 

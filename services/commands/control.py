@@ -13,6 +13,7 @@ from proto.bus import open_bus
 from proto.codec import encode
 from proto.keys import Role
 from proto.messages import Command, Control, ControlReply
+from proto.plain_text import plain
 from services.arguments.common import add_connection, config_of
 
 ROLES: Final = tuple(role for role in Role if role is not Role.WATCH)
@@ -54,4 +55,4 @@ def _show(replies: Sequence[ControlReply], *, as_json: bool) -> None:
         print(json.dumps([json.loads(encode(reply).payload) for reply in replies], indent=2))
         return
     for reply in replies:
-        print(f"{reply.role} {reply.id}: {reply.note}")
+        print(plain(f"{reply.role} {reply.id}: {reply.note}"))

@@ -10,8 +10,6 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from actors.tasks.registry import make_task
 from proto.config import Config
 from proto.errors import UserError
@@ -21,6 +19,7 @@ from services.arguments.common import add_config, add_playing, playing_config, p
 from services.playing.video import write_video
 from services.playing.video_file import video_argument
 from services.playing.workers import Job, play_all
+from services.terminal.console import make_console
 from services.terminal.progress import progress_bar
 from services.terminal.tables import success_table
 from services.trials.evaluation import result_json, situation_jobs, trial_jobs
@@ -86,7 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(result))
     else:
         title = "{policy} on {task} in {backend}, {trials} trials, {wall_s:.1f} s".format(**result)
-        Console().print(success_table(title, tally))
+        make_console().print(success_table(title, tally))
     if arguments.video is not None and first is not None:
         write_video(first, arguments.video, config)
     return 0

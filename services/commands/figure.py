@@ -8,8 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, Protocol
 
-from rich.console import Console
-
 from services.commands.figures import (
     activity,
     corrections,
@@ -21,6 +19,7 @@ from services.commands.figures import (
 )
 from services.figures.figure_result import FigureResult
 from services.figures.style import check_name, save
+from services.terminal.console import make_console
 
 
 class FigureCommand(Protocol):
@@ -69,6 +68,6 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps(drawn.numbers))
     else:
-        Console().print(drawn.table)
+        make_console().print(drawn.table)
         print(arguments.out)
     return 0

@@ -7,8 +7,6 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-from rich.console import Console
-
 from actors.tasks.registry import make_task
 from learner.checkpoint import load_checkpoint
 from learner.network.subnets import subnets
@@ -18,6 +16,7 @@ from proto.config import load_config
 from proto.episode import Episode
 from services.arguments.common import add_config, config_of
 from services.arguments.training import filled_store
+from services.terminal.console import make_console
 from services.terminal.network_tables import (
     classifier_table,
     regression_table,
@@ -69,7 +68,7 @@ def _inspect_network(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(json.dumps([subnet_numbers(subnet) for subnet in network], indent=2))
     else:
-        Console().print(subnet_table(network))
+        make_console().print(subnet_table(network))
 
 
 def _inspect_checkpoint(arguments: argparse.Namespace) -> None:
@@ -87,7 +86,7 @@ def _inspect_task(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(json.dumps(task_description(task), indent=2))
     else:
-        Console().print(task_table(task))
+        make_console().print(task_table(task))
 
 
 def _inspect_vision(arguments: argparse.Namespace) -> None:
@@ -100,7 +99,7 @@ def _inspect_vision(arguments: argparse.Namespace) -> None:
         found = {"sequences": len(tested), "classifier": classifier, "regression": regression}
         print(json.dumps(found, indent=2, default=asdict))
         return
-    console = Console()
+    console = make_console()
     if classifier:
         console.print(classifier_table(classifier, len(tested)))
     console.print(regression_table(regression, len(learned), len(tested)))

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from actors.tasks.registry import make_pretraining_task, make_task
@@ -22,6 +21,7 @@ from proto.body import ARM, FOCUS, GRASP, NECK
 from proto.metrics import Stage
 from services.arguments.common import add_config, config_of
 from services.arguments.training import add_training_data, interruption, training_stores
+from services.terminal.console import make_console
 
 _INTERRUPTED: Final = 130
 _LINE_PERIOD_S: Final = 5.0
@@ -73,7 +73,7 @@ def _progress(trainer: Trainer) -> Iterator[Callable[[float], None]]:
 
     On a terminal it updates a progress bar; elsewhere it prints a line every few seconds.
     """
-    console = Console()
+    console = make_console()
     if not console.is_terminal:
         yield _line_printer(trainer)
         return

@@ -6,11 +6,10 @@ import argparse
 from contextlib import closing
 from pathlib import Path
 
-from rich.console import Console
-
 from actors.tasks.registry import make_task
 from services.arguments.common import add_config, add_playing, playing_config, positive, seed
 from services.playing.tutoring import parse_cases, record, tutoring_jobs
+from services.terminal.console import make_console
 from services.terminal.progress import progress_bar
 from services.terminal.tables import success_table
 from services.trials.success import Tally
@@ -53,5 +52,5 @@ def run(arguments: argparse.Namespace) -> int:
         for episode in episodes:
             tally.add(episode.outcome)
             advance()
-    Console().print(success_table(f"{tally.trials} sequences in {arguments.out}", tally))
+    make_console().print(success_table(f"{tally.trials} sequences in {arguments.out}", tally))
     return 0

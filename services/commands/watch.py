@@ -8,14 +8,13 @@ import os
 import sys
 from typing import Final
 
-from rich.console import Console
-
 from proto.bus import open_bus
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
 from services.arguments.common import add_connection, config_of
 from services.board import Board, RunView
+from services.terminal.console import make_console
 from services.terminal.display import display
 from services.terminal.run_tables import run_tables
 
@@ -38,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
             return _show_once(board.wait_for_all(ONCE_WITHIN_S), arguments.json)
         lifecycle = Lifecycle()
         lifecycle.stop_on_signals()
-        with display(Console()) as show:
+        with display(make_console()) as show:
             while not lifecycle.stopping:
                 show(board.view())
                 lifecycle.wait(METRICS_PERIOD_S)
@@ -56,5 +55,5 @@ def _show_once(view: RunView, as_json: bool) -> int:
     if as_json:
         print(json.dumps(view.as_json(), indent=2))
     else:
-        Console().print(run_tables(view))
+        make_console().print(run_tables(view))
     return 0

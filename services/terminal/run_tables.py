@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from proto.metrics import ActorMetrics, LearnerMetrics, PolicyScore, RecorderMetrics
+from proto.plain_text import plain
 from services.board import RunView
 from services.terminal.run_words import actors_words, stage_words, success_words
 
@@ -21,17 +22,19 @@ ROWS_SHOWN: Final = 12
 
 def run_tables(view: RunView) -> RenderableType:
     """The state of a run as tables."""
-    parts: list[RenderableType] = [Text(f"run {view.run}", style="bold")]
+    parts: list[RenderableType] = [Text(plain(f"run {view.run}"), style="bold")]
     parts += [_learner_table(learner) for learner in view.living(LearnerMetrics)]
     parts.append(_actors_table(view.living(ActorMetrics)))
     if view.scores:
         parts.append(_scores_table(view.scores))
     parts += [
-        Text(f"recorder {m.id}: {m.episodes} episodes, {m.bytes / 1e6:.1f} MB, {m.dropped} dropped")
+        _text(
+            f"recorder {m.id}: {m.episodes} episodes, {m.bytes / 1e6:.1f} MB, {m.dropped} dropped"
+        )
         for m in view.living(RecorderMetrics)
     ]
     parts += [
-        Text(f"{role} {name} is gone for {time.time() - since_s:.0f} s", style="red")
+        Text(plain(f"{role} {name} is gone for {time.time() - since_s:.0f} s"), style="red")
         for (role, name), since_s in sorted(view.vanished_s.items())
     ]
     return Group(*parts)
@@ -40,7 +43,7 @@ def run_tables(view: RunView) -> RenderableType:
 def _learner_table(learner: LearnerMetrics) -> Table:
     table = Table("learner", "stage", "epoch", "", "loss", "sequences", "epochs/s", "policy")
     table.add_row(
-        learner.id,
+        _text(learner.id),
         "paused" if learner.paused else stage_words(learner),
         f"{learner.epoch}/{learner.epochs_total}",
         ProgressBar(total=max(learner.epochs_total, 1), completed=learner.epoch, width=20),
@@ -57,17 +60,22 @@ def _actors_table(actors: Sequence[ActorMetrics]) -> Table:
     for actor in actors[:ROWS_SHOWN]:
         last = f"{actor.last_kind}: {actor.last_outcome}" if actor.last_kind else ""
         table.add_row(
-            actor.id,
+            _text(actor.id),
             str(actor.policy_version),
             f"{actor.steps_per_s:.1f}",
             str(actor.episodes),
-            "paused" if actor.paused else last,
+            _text("paused" if actor.paused else last),
             _outbox_words(actor),
-            actor.backend,
+            _text(actor.backend),
         )
     if len(actors) > ROWS_SHOWN:
         table.caption = f"and {len(actors) - ROWS_SHOWN} more; all: {actors_words(actors)}"
     return table
+
+
+def _text(text: str) -> Text:
+    """A text from a message: shown as it is, without markup and control codes."""
+    return Text(plain(text, 100))
 
 
 def _outbox_words(actor: ActorMetrics) -> str:
@@ -84,6 +92,6 @@ def _scores_table(scores: Sequence[PolicyScore]) -> Table:
             str(score.version),
             str(score.trials),
             *(success_words(s, score.trials) for s in (score.lenient, score.strict, score.precise)),
-            ", ".join(f"{reason} {count}" for reason, count in reasons if reason != "none"),
+            _text(", ".join(f"{reason} {count}" for reason, count in reasons if reason != "none")),
         )
     return table

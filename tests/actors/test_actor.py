@@ -14,16 +14,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fitting import make_policy
 from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
 
 from actors.tasks.experiment1.plan import plan
 from actors.tasks.registry import make_task
-from learner.training.trainer import Trainer
-from learner.training.vmdnn_recipe import VMDNNRecipe
-from learner.tutoring.store import TutoringStore
 from proto.bus import Bus, open_bus
-from proto.config import Config, HubConfig, LearnerConfig, PretrainingConfig, TaskConfig
+from proto.config import HubConfig, TaskConfig, load_config
 from proto.episode import Episode, Kind
 from proto.keys import Role
 from proto.messages import (
@@ -51,24 +49,13 @@ TASK = make_task(TaskConfig())
 
 
 @pytest.fixture(scope="module")
-def policy(
-    make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory
-) -> Callable[..., PolicyVersion]:
-    """Return a function that makes versions of a policy that was trained for one epoch."""
-    store = TutoringStore(tmp_path_factory.mktemp("tutoring"))
-    store.add(make_episode(20, kind=Kind.TUTORING, situation=dict(TASK.tutored()[0])))
-    config = Config(learner=LearnerConfig(pretraining=PretrainingConfig(epochs=0)))
-    trainer = Trainer(VMDNNRecipe(config, TASK.questions), store)
-    trainer.epoch()
-
-    def make(version: int, run_id: str = "training") -> PolicyVersion:
-        return PolicyVersion(run_id, version, 1, 0.5, "digest", trainer.policy_bytes(version))
-
-    return make
+def policy() -> Callable[..., PolicyVersion]:
+    """Return a function that makes versions of a policy with random weights."""
+    return make_policy
 
 
 class ActorSetup:
-    """A hub, an actor, and a session that plays the role of learner and evaluator."""
+    """A hub, an actor, and sessions that play the roles of learner and evaluator."""
 
     def __init__(self, stack: ExitStack, folder: Path) -> None:
         self._stack = stack
@@ -95,6 +82,11 @@ class ActorSetup:
         self.bus: Bus = stack.enter_context(
             open_bus(HubConfig(endpoint=self.endpoint), "test", Role.LEARNER, "learner")
         )
+        self.evaluator: Bus = stack.enter_context(
+            open_bus(HubConfig(endpoint=self.endpoint), "test", Role.EVALUATOR, "evaluator")
+        )
+        for bus in (self.bus, self.evaluator):
+            bus.announce()
         self._lock = threading.Lock()
         keys = self.bus.keys
         self.bus.answer(keys.request_tutoring, TutoringRequest, self._on_request)
@@ -115,6 +107,10 @@ class ActorSetup:
 
     def publish(self, policy: PolicyVersion) -> None:
         self.bus.publish_newest(self.bus.keys.policy, policy)
+
+    def holds(self, run_id: str, version: int) -> bool:
+        """Whether the actor has asked for a case with this policy."""
+        return any((r.run_id, r.policy_version) == (run_id, version) for r in self.requests)
 
     def wait_for_metrics(self, ready: Callable[[ActorMetrics], bool]) -> ActorMetrics:
         """Wait until the newest metrics satisfy `ready`."""
@@ -147,12 +143,15 @@ class ActorSetup:
 
     def _on_failure(self, report: EpisodeFailed) -> None:
         self.failures.append(report)
-        self.bus.deliver(self.bus.keys.receipt(report.actor), Receipt(report.id))
+        sender = self.evaluator if report.kind is Kind.TRIAL else self.bus
+        sender.deliver(self.bus.keys.receipt(report.actor), Receipt(report.id))
 
     def _acknowledge(self, episode: Episode) -> None:
         if self.gives_receipts:
             receipt = Receipt(episode.id, self.refusal)
-            self.bus.deliver(self.bus.keys.receipt(episode.actor), receipt)
+            rollout = episode.kind in (Kind.TRIAL, Kind.PRACTICE)
+            sender = self.evaluator if rollout else self.bus
+            sender.deliver(self.bus.keys.receipt(episode.actor), receipt)
 
 
 @pytest.fixture
@@ -221,7 +220,7 @@ def test_its_policy_is_guided_in_situations_that_the_learner_requests(
     assert {(r.run_id, r.policy_version) for r in setup.requests} == {("", 0)}
 
     setup.publish(policy(4))
-    eventually(lambda: TutoringRequest("actor-1", "training", 4) in setup.requests, "it holds it")
+    eventually(lambda: setup.holds("training", 4), "it holds it")
     outside = {**situation, "object_y_m": 0.9}
     setup.cases += [Correction("experiment1", 4, outside), asked]
     eventually(lambda: len(setup.sequences) == 1, "a correction")
@@ -263,6 +262,48 @@ def test_a_policy_changes_between_episodes_only(
     assert {step for _, step in changes} == {0}
     versions = [(r.run_id, r.episode.policy_version) for r in list(setup.rollouts)]
     assert list(dict.fromkeys(versions)) == [("training", 1), ("training", 3), ("new", 1)]
+
+
+def test_policies_that_do_not_fit_are_refused_and_it_goes_on(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    setup.publish(policy(1))
+    setup.start_actor()
+    eventually(lambda: bool(setup.rollouts), "it practises with policy 1")
+    other = load_config(None, ["network.mstnn_fast.stride=3"]).network
+    for odd in (
+        policy(10**6, network=other),
+        replace(policy(2), version=1000, epoch=1000),
+        policy(3, task="reaching"),
+        replace(policy(4), weights=b"damaged"),
+    ):
+        setup.publish(odd)
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.refused == 4)
+    assert metrics.policy_version == 1
+    played = metrics.episodes
+    setup.wait_for_metrics(lambda metrics: metrics.episodes > played)
+    setup.publish(policy(2))
+    setup.wait_for_metrics(lambda metrics: metrics.policy_version == 2)
+
+
+def test_receipts_of_those_who_store_nothing_delete_nothing(setup: ActorSetup) -> None:
+    setup.gives_receipts = False
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.start_actor()
+    eventually(lambda: len(setup.sequences) >= 1, "a demonstration")
+    receipt = Receipt(setup.sequences[0].id)
+    key = setup.bus.keys.receipt("actor-1")
+    hub = HubConfig(endpoint=setup.endpoint)
+    with (
+        open_bus(hub, "test", Role.WATCH, "stranger") as stranger,
+        open_bus(hub, "test", Role.LEARNER, "absent") as absent,
+    ):
+        for bus in (stranger, absent, setup.evaluator):
+            bus.deliver(key, receipt)
+        metrics = setup.wait_for_metrics(lambda metrics: metrics.refused == 2)
+    assert metrics.outbox == 1
+    setup.bus.deliver(key, receipt)
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
 
 
 def test_a_killed_actor_sends_messages_without_receipt_again(setup: ActorSetup) -> None:
@@ -343,7 +384,7 @@ def test_a_failed_simulation_is_reported_to_learner_and_evaluator(
     assert "NaN" in shown.problem
 
     setup.publish(policy(4))
-    eventually(lambda: TutoringRequest("actor-1", "training", 4) in setup.requests, "it holds it")
+    eventually(lambda: setup.holds("training", 4), "it holds it")
     setup.cases.append(Correction("experiment1", 3, situation))
     setup.trials.append(Trial(seed=80))
     eventually(lambda: len(setup.failures) == 3, "a correction and a trial fail")

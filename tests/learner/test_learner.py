@@ -11,6 +11,7 @@ from subprocess import Popen
 
 import numpy as np
 import pytest
+from fitting import fitting_fields, settings_digest
 from outcomes import NOT_LIFTED
 from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
@@ -42,7 +43,7 @@ from proto.messages import (
     Verdict,
 )
 from proto.metrics import LearnerMetrics, Stage
-from proto.recordings.episodes import read_episode
+from proto.recordings.episodes import read_episode, write_episode
 
 MakeEpisode = Callable[..., Episode]
 SETTINGS = {
@@ -73,12 +74,14 @@ class LearnerSetup:
         self._stack = stack
         self._make_episode = make_episode
         self.folder = folder / "test"
+        self.settings = [f"{key}={value}" for key, value in SETTINGS.items()]
         self.endpoint = free_endpoint()
         self.words = ["--connect", self.endpoint, "--set", f"run.folder={folder}"]
         for key, value in SETTINGS.items():
             self.words += ["--set", f"{key}={value}"]
         stack.enter_context(listening_hub(self.endpoint))
         self.actor = self.join("actor")
+        self.evaluator = self.join("evaluator", Role.EVALUATOR)
         self.actor.announce()
         self.policies: list[PolicyVersion] = []
         self.metrics: LearnerMetrics | None = None
@@ -93,14 +96,16 @@ class LearnerSetup:
         self.metrics = None
         self.process = self._stack.enter_context(vmdnn("learner", *self.words, *more))
 
-    def join(self, name: str) -> Bus:
-        bus = open_bus(HubConfig(endpoint=self.endpoint), "test", Role.ACTOR, name)
+    def join(self, name: str, role: Role = Role.ACTOR) -> Bus:
+        bus = open_bus(HubConfig(endpoint=self.endpoint), "test", role, name)
         return self._stack.enter_context(bus)
 
     def ask(self) -> list[TutoringCase | Correction]:
         """Send a request as an actor that has the newest policy."""
         newest = [(policy.run_id, policy.version) for policy in self.policies[-1:]]
-        request = TutoringRequest("actor", *(newest[0] if newest else ("", 0)))
+        request = TutoringRequest(
+            "actor", *(newest[0] if newest else ("", 0)), settings_digest(*self.settings)
+        )
         key = self.actor.keys.request_tutoring
         answers: list[TutoringCase | Correction]
         answers = self.actor.ask(key, request, TutoringCase, Correction)
@@ -118,15 +123,16 @@ class LearnerSetup:
 
     def correction(self, asked: Correction, **fields: object) -> Episode:
         given = {
+            **fitting_fields(asked.task, *self.settings),
             "id": f"corrected{asked.seed}",
-            "task": asked.task,
             "seed": asked.seed,
             "situation": dict(asked.situation),
             "policy_version": self.policies[-1].version,
             "training": self.policies[-1].run_id,
             **fields,
         }
-        return self._make_episode(20, kind=Kind.CORRECTION, actor="actor", **given)
+        steps = len(given["phases"])
+        return self._make_episode(steps, kind=Kind.CORRECTION, actor="actor", **given)
 
     def fail_in_practice(self, seed: int) -> Correction:
         """Report a failure of practice until the learner requests a correction there."""
@@ -136,7 +142,7 @@ class LearnerSetup:
         asked: list[TutoringCase | Correction] = []
 
         def heard() -> bool:
-            self.actor.deliver(self.actor.keys.verdict, verdict)
+            self.evaluator.deliver(self.actor.keys.verdict, verdict)
             asked.extend(self.ask())
             return bool(asked)
 
@@ -147,13 +153,14 @@ class LearnerSetup:
     def episode(self, shown: TutoringCase, **fields: object) -> Episode:
         task = make_task(TaskConfig.model_validate({"name": shown.task}))
         given = {
+            **fitting_fields(shown.task, *self.settings),
             "id": f"case{shown.case}",
-            "task": shown.task,
             "seed": shown.seed,
             "situation": dict(task.tutored()[shown.case]),
             **fields,
         }
-        return self._make_episode(20, kind=Kind.TUTORING, actor="actor", **given)
+        steps = len(given["phases"])
+        return self._make_episode(steps, kind=Kind.TUTORING, actor="actor", **given)
 
     def send(self, episode: Episode) -> str:
         """Send a sequence until its receipt arrives; return the refusal, empty if accepted."""
@@ -226,11 +233,59 @@ def test_it_requests_each_case_once_and_stores_the_sequences(setup: LearnerSetup
     assert stop(setup.process) == 0
 
 
+def test_sequences_that_do_not_fit_are_refused_and_a_poisoned_folder_is_cleared(
+    setup: LearnerSetup,
+) -> None:
+    setup.start()
+    shown = setup.ask_until_given()
+    assert isinstance(shown, TutoringCase)
+    fine = setup.episode(shown)
+    one_step = {
+        name: getattr(fine, name)[:1]
+        for name in ("images", "actions", "targets", "joints_deg", "phases", "body_poses")
+    } | {"outputs": None}
+    outside = {**fine.situation, "object_y_m": 1e12}
+    for name, wrong, problem in (
+        ("one-step", one_step, "it has 1 steps"),
+        ("nowhere", {"situation": {}}, "its situation is not the one of the seed 0"),
+        ("outside", {"situation": outside}, "its situation is not the one of the seed 0"),
+        ("foreign", {"config_digest": "other"}, "its configuration is not that of this run"),
+        ("too-far", {"actions": fine.actions - 100}, "not within what the robot accepts"),
+        ("phases", {"phases": np.zeros_like(fine.phases)}, "its phases are not those"),
+        ("too-late", {"seed": 2**60}, "no tutored case"),
+    ):
+        assert problem in setup.send(replace(fine, id=name, **wrong))
+    assert setup.send(fine) == ""
+    same_id = setup.send(replace(setup.episode(case(20, 0)), id=fine.id))
+    assert same_id == "another sequence with this id is stored"
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.sequences == 1)
+    assert metrics.stage is Stage.WAITING
+    assert metrics.refused >= 8, "messages are sent until they are answered"
+
+    setup.process.kill()
+    setup.process.wait()
+    folder = setup.folder / "tutoring"
+    poison = setup.episode(case(20, 0))
+    write_episode(folder / "p1.mcap", replace(poison, id="p1", situation={}))
+    write_episode(folder / "p2.mcap", replace(poison, targets=poison.targets * 1e12, id="../p2"))
+    short = setup.episode(case(20, 0), **one_step)
+    write_episode(folder / "p3.mcap", replace(short, id="p3"))
+    setup.start()
+    assert setup.ask_until_given() == case(20, 0), "it is still missing"
+    metrics = setup.wait_for_metrics(lambda metrics: metrics.sequences == 1)
+    assert metrics.damaged == 3
+    assert {path.name for path in folder.iterdir()} == {
+        *("case0.mcap", "p1.refused", "p2.refused", "p3.refused")
+    }
+    assert stop(setup.process) == 0
+
+
 def test_pretraining_has_its_own_cases_and_does_not_wait_for_the_others(
     setup: LearnerSetup,
 ) -> None:
     asked = {"task": "reaching", "cases": "[0,14]", "repeats": 1, "epochs": 3}
     words = [f"--set=learner.pretraining.{name}={value}" for name, value in asked.items()]
+    setup.settings.append("learner.pretraining.task=reaching")
     setup.start(*words, "--set", "learner.publish_every_epochs=400")
     first, second = case(0, 0, "reaching"), case(14, 0, "reaching")
     assert [setup.ask_until_given(), *setup.ask(), *setup.ask()] == [first, second, case(0, 0)]

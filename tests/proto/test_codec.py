@@ -50,14 +50,14 @@ COUNTS = st.integers(0, 2**31)
 MESSAGES = st.one_of(
     st.builds(Receipt, IDS),
     st.builds(TutoringCase, WORDS, COUNTS, COUNTS),
-    st.builds(TrialRequest, IDS, IDS, COUNTS),
+    st.builds(TrialRequest, IDS, IDS, COUNTS, WORDS),
     st.builds(Trial, st.integers(0, 2**63 - 1)),
     st.builds(Control, st.sampled_from(Command)),
     st.builds(
         PolicyVersion,
         IDS,
-        st.integers(1, 2**31),
-        COUNTS,
+        st.integers(1, 10**6),
+        st.integers(10**6, 2**31),
         st.floats(0, 1e9),
         WORDS,
         st.binary(min_size=1, max_size=2000),

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from subprocess import Popen
 
+import numpy as np
 import pytest
+from fitting import fitting_fields, make_policy, settings_digest, task_called
 from outcomes import NOT_LIFTED, PRECISE
 from ports import free_endpoint
 from processes import PATIENCE_S, eventually, listening_hub, run_vmdnn, stop, vmdnn
 
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig
-from proto.episode import Episode, Kind
+from proto.episode import Episode, Kind, Outcome
 from proto.keys import Role
 from proto.messages import (
     Command,
     Control,
     ControlReply,
     EpisodeFailed,
-    PolicyVersion,
     Receipt,
     Rollout,
     Trial,
@@ -29,7 +31,10 @@ from proto.messages import (
     Verdict,
 )
 from proto.metrics import EvaluatorMetrics
+from services.evaluator import _reasons
+from services.trials.success import Tally
 
+TASK = task_called("experiment1")
 MakeEpisode = Callable[..., Episode]
 
 
@@ -50,6 +55,7 @@ class EvaluatorSetup:
         stack.enter_context(listening_hub(self.endpoint))
         self.metrics: EvaluatorMetrics | None = None
         self.learner = self.join(Role.LEARNER, "learner")
+        self.learner.announce()
         self.learner.subscribe(
             self.learner.keys.metrics(Role.EVALUATOR), self._listen, EvaluatorMetrics
         )
@@ -67,11 +73,11 @@ class EvaluatorSetup:
         return self._stack.enter_context(bus)
 
     def publish(self, version: int, run_id: str = "training") -> None:
-        policy = PolicyVersion(run_id, version, 10, 0.5, "digest", b"weights")
+        policy = make_policy(version, run_id)
         self.learner.publish_newest(self.learner.keys.policy, policy)
 
     def ask(self, actor: Bus, version: int, run_id: str = "training") -> list[int]:
-        request = TrialRequest(actor.id, run_id, version)
+        request = TrialRequest(actor.id, run_id, version, settings_digest())
         key = actor.keys.request_trial
         given = actor.ask(
             key, request, Trial, timeout_s=PATIENCE_S
@@ -100,14 +106,14 @@ class EvaluatorSetup:
     def send(self, actor: Bus, seed: int, version: int, **fields: object) -> Episode:
         """Send a rollout until its receipt arrives."""
         episode = self._episode(actor, seed, version, **fields)
-        rollout = Rollout(episode, "training")
+        rollout = Rollout(episode, episode.training)
         assert self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout) == ""
         return episode
 
     def refused(self, actor: Bus, seed: int, version: int, **fields: object) -> str:
         """Send a rollout until it is refused; return the reason."""
         episode = self._episode(actor, seed, version, **fields)
-        rollout = Rollout(episode, "training")
+        rollout = Rollout(episode, episode.training)
         return self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout)
 
     def fail(self, actor: Bus, report: EpisodeFailed) -> str:
@@ -115,8 +121,17 @@ class EvaluatorSetup:
         return self._answer(actor, report.id, actor.keys.failure(actor.id), report)
 
     def _episode(self, actor: Bus, seed: int, version: int, **fields: object) -> Episode:
-        given = {"kind": Kind.TRIAL, "outcome": PRECISE, "id": f"{seed}-{version}", **fields}
-        return self._make_episode(3, actor=actor.id, seed=seed, policy_version=version, **given)
+        given = {
+            **fitting_fields(),
+            "kind": Kind.TRIAL,
+            "outcome": PRECISE,
+            "id": f"{seed}-{version}",
+            "situation": dict(TASK.sample(seed)),
+            "training": "training",
+            **fields,
+        }
+        steps = len(given["phases"])
+        return self._make_episode(steps, actor=actor.id, seed=seed, policy_version=version, **given)
 
     def _answer(self, actor: Bus, name: str, key: str, message: object) -> str:
         receipts: list[Receipt] = []
@@ -159,7 +174,7 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
     setup.send(other, 70, 1, id="another-episode-of-this-trial", outcome=NOT_LIFTED)
     setup.send(other, 71, 1, outcome=NOT_LIFTED)
     assert setup.refused(other, 99, 1) == "no trial with the seed 99 is asked for"
-    setup.send(actor, 5, 1, kind=Kind.PRACTICE)
+    setup.send(actor, 2**30 + 5, 1, kind=Kind.PRACTICE)
     metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 2})
     score = metrics.policies[0]
     assert (score.precise.successes, score.precise.rate) == (1, 0.5)
@@ -169,6 +184,7 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
 
     setup.publish(2)
     assert setup.ask_until_given(actor, 2) == 70
+    assert [*setup.ask(actor, 2), *setup.ask(actor, 2)] == [71, 72]
     assert setup.ask(actor, 1) == [], "only the newest policy is tried"
     setup.send(actor, 72, 1)  # was under way when the newer policy came
     for seed in (70, 71, 72):
@@ -177,6 +193,60 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
     assert metrics.done
     assert metrics.leases == 0
     assert setup.ask(actor, 2) == [], "the newest policy is counted in full"
+
+
+def test_nothing_counts_that_was_not_asked_for(setup: EvaluatorSetup) -> None:
+    actor, stranger = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "s")
+    setup.publish(1)
+    assert setup.ask_until_given(actor, 1) == 70
+    request = TrialRequest("s", "training", 1, settings_digest("task.attention=fixed"))
+    assert stranger.ask(stranger.keys.request_trial, request, Trial) == []
+    for name, wrong, problem in (
+        ("no-lease", {}, "was not asked of s"),
+        ("no-training", {"training": "invented"}, "no policy 1 of the training invented"),
+        ("no-place", {"situation": {}}, "its situation is not the one of the seed 70"),
+        ("case", {"situation": dict(TASK.sample(71))}, "its situation is not the one"),
+    ):
+        assert problem in setup.refused(stranger, 70, 1, id=name, **wrong)
+    for name, wrong, problem in (
+        ("config", {"config_digest": settings_digest("task.attention=fixed")}, "configuration"),
+        ("short", {"phases": TASK.phases[:9], "actions": np.zeros((9, 11), np.float32)}, "9 steps"),
+    ):
+        steps = len(wrong.get("phases", TASK.phases))  # type: ignore[arg-type]
+        fields = {"targets": np.zeros((steps, 11), np.float32), **wrong}
+        assert problem in setup.refused(actor, 70, 1, id=name, **fields)
+
+    # Policies that this run never published change nothing, nor do trials of them.
+    for odd in (make_policy(10**6, task="reaching"), replace(make_policy(2), version=5, epoch=50)):
+        setup.learner.publish_newest(setup.learner.keys.policy, odd)
+    unheard = Rollout(setup._episode(stranger, 70, 9, id="version-9"), "training")
+    stranger.deliver(stranger.keys.rollout("s"), unheard)
+    setup.send(actor, 70, 1, outcome=PRECISE)
+    many = [Outcome(False, False, False, f"reason_{number}", {}) for number in range(2)]
+    assert [*setup.ask(actor, 1), *setup.ask(actor, 1)] == [71, 72]
+    for seed, outcome in zip((71, 72), many, strict=True):
+        setup.send(actor, seed, 1, outcome=outcome)
+    metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 3})
+    assert metrics.policies[0].reasons == {"reason_0": 1, "reason_1": 1}
+    assert metrics.refused >= 9, "messages are sent until they are answered"
+
+
+def test_many_reasons_fit_into_the_metrics() -> None:
+    tally = Tally.of(Outcome(False, False, False, f"reason_{n}", {}) for n in range(100))
+    told = _reasons(tally)
+    assert len(told) == 32
+    assert sum(told.values()) == 100
+
+
+def test_a_trial_that_an_evaluator_before_asked_for_is_not_lost(setup: EvaluatorSetup) -> None:
+    actor = setup.join(Role.ACTOR, "a")
+    setup.publish(1)
+    assert setup.ask_until_given(actor, 1) == 70
+    setup.process.kill()
+    setup.process.wait()
+    setup.start()
+    setup.send(actor, 70, 1)
+    setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 1})
 
 
 def test_the_learner_gets_verdicts_of_practice_but_not_of_trials(
@@ -221,6 +291,7 @@ def test_a_trial_whose_simulation_fails_is_a_failure_and_is_not_played_again(
     setup.publish(1)
     assert setup.ask_until_given(actor, 1) == 70
     trial = {"actor": "a", "kind": Kind.TRIAL, "training": "training", "policy_version": 1}
+    trial["situation"] = dict(TASK.sample(70))
     assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
     assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
     assert "seed 99" in setup.fail(actor, failure("nobody-asked", seed=99, **trial))

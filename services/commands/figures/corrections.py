@@ -7,14 +7,13 @@ import os
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console
-
 from proto.errors import UserError
 from proto.seeds import TRIALS_BELOW
 from services.arguments.common import positive, seed
 from services.figures import corrections
 from services.figures.corrections import Curve
 from services.figures.figure_result import FigureResult
+from services.terminal.console import make_console
 from services.terminal.progress import progress_bar
 from services.trials.round_trials import Run, open_run
 from services.trials.success import Tally
@@ -49,7 +48,7 @@ def draw(arguments: argparse.Namespace) -> FigureResult:
     try:
         curves = [_curve(run, arguments) for run in runs]
     except KeyboardInterrupt:
-        console = Console(stderr=True)
+        console = make_console(stderr=True)
         console.print(
             "stopped; the same command continues with the trials counted in the runs' folders"
         )

@@ -15,21 +15,27 @@ from learner.tutoring.failures import TRIES
 from proto.config import Config, TaskConfig
 from proto.episode import Episode, Kind, Outcome
 from proto.messages import Correction, EpisodeFailed, TutoringRequest, Verdict
-from proto.seeds import CORRECTIONS
+from proto.seeds import CORRECTIONS, PRACTICE
 
 MakeEpisode = Callable[..., Episode]
 TASK = make_task(TaskConfig())
 POLICY = ("training", 7)
+P = PRACTICE.start
 
 
-def make_round(number: int = 1, cases: tuple[int, ...] | None = None, **given: Any) -> Round:
+def make_round(
+    number: int = 1,
+    cases: tuple[int, ...] | None = None,
+    resumed: bool = False,
+    **given: Any,
+) -> Round:
     corrections = {"rounds": 3, "choose": "failures", "sequences": 2, "tries": 5, **given}
     config = Config.model_validate({"learner": {"cases": cases, "corrections": corrections}})
-    return Round(config, number, POLICY, TASK)
+    return Round(config, number, POLICY, TASK, resumed=resumed)
 
 
 def ask(round_: Round, actor: str = "actor", policy: tuple[str, int] = POLICY) -> Correction | None:
-    return round_.next_correction(TutoringRequest(actor, *policy))
+    return round_.next_correction(TutoringRequest(actor, *policy, "digest"))
 
 
 def ask_all(round_: Round) -> list[Correction]:
@@ -62,21 +68,21 @@ def correction(make_episode: MakeEpisode) -> Callable[..., Episode]:
 def test_failures_of_practice_are_corrected(correction: Callable[..., Episode]) -> None:
     round_ = make_round()
     assert ask(round_) is None
-    round_.judge(verdict(1, PRECISE))
-    round_.judge(verdict(2))
-    round_.judge(verdict(2))  # a rollout that was sent twice
-    assert ask_all(round_) == [Correction("experiment1", 2, TASK.sample(2))]
+    round_.judge(verdict(P + 1, PRECISE))
+    round_.judge(verdict(P + 2))
+    round_.judge(verdict(P + 2))  # a rollout that was sent twice
+    assert ask_all(round_) == [Correction("experiment1", P + 2, TASK.sample(P + 2))]
     assert (round_.judged, round_.kept, round_.most) == (2, 0, 2)
 
-    round_.keep(correction(2))
-    round_.judge(verdict(2))
+    round_.keep(correction(P + 2))
+    round_.judge(verdict(P + 2))
     assert ask(round_) is None
     assert not round_.complete, "there may be more failures"
-    round_.judge(verdict(3))
-    round_.judge(verdict(4))
-    assert [asked.seed for asked in ask_all(round_)] == [3], "two are enough"
+    round_.judge(verdict(P + 3))
+    round_.judge(verdict(P + 4))
+    assert [asked.seed for asked in ask_all(round_)] == [P + 3], "two are enough"
     assert not round_.complete
-    round_.keep(correction(3))
+    round_.keep(correction(P + 3))
     assert round_.complete
     assert round_.kept == 2
 
@@ -85,14 +91,14 @@ def test_the_search_for_failures_of_a_good_policy_ends(
     correction: Callable[..., Episode],
 ) -> None:
     round_ = make_round()
-    round_.judge(verdict(0))
+    round_.judge(verdict(P))
     for seed in range(1, 5):
         assert not round_.complete
-        round_.judge(verdict(seed, PRECISE))
+        round_.judge(verdict(P + seed, PRECISE))
     assert not round_.complete, "the one failure is still to be corrected"
-    round_.judge(verdict(9))
-    assert [asked.seed for asked in ask_all(round_)] == [0]
-    round_.keep(correction(0))
+    round_.judge(verdict(P + 9))
+    assert [asked.seed for asked in ask_all(round_)] == [P]
+    round_.keep(correction(P))
     assert round_.complete
 
 
@@ -101,7 +107,7 @@ def test_the_search_for_failures_of_a_good_policy_ends(
 )
 def test_only_practice_of_the_newest_policy_counts(foreign: dict[str, Any]) -> None:
     round_ = make_round()
-    round_.judge(verdict(2, **foreign))
+    round_.judge(verdict(P + 2, **foreign))
     assert ask(round_) is None
     assert round_.judged == 0
 
@@ -191,22 +197,55 @@ def test_a_situation_that_was_given_up_is_not_chosen_again(
     failure: Callable[..., EpisodeFailed],
 ) -> None:
     round_ = make_round()
-    round_.judge(verdict(2))
-    policy = {"kind": Kind.CORRECTION, "training": "training", "policy_version": 7, "seed": 2}
+    round_.judge(verdict(P + 2))
+    policy = {"kind": Kind.CORRECTION, "training": "training", "policy_version": 7, "seed": P + 2}
     for attempt in range(TRIES):
+        assert ask(round_) is not None
         round_.fail(failure(f"{attempt}", **policy))
-    round_.judge(verdict(2))
+    round_.judge(verdict(P + 2))
     assert ask(round_) is None
 
 
 def test_corrections_requested_before_a_restart_are_accepted(
     correction: Callable[..., Episode],
 ) -> None:
-    round_ = make_round()  # knows of no failure any more
-    assert round_.wants(correction(77))
-    round_.keep(correction(77))
-    assert not round_.wants(correction(77))
-    round_.judge(verdict(78))
-    assert not round_.wants(correction(79)), "two are enough"
-    round_.keep(correction(78))
+    assert not make_round().wants(correction(P + 77)), "no former process began this round"
+    round_ = make_round(resumed=True)  # knows of no failure any more
+    assert not round_.wants(correction(77)), "not a seed of practice"
+    assert round_.wants(correction(P + 77))
+    round_.keep(correction(P + 77))
+    assert not round_.wants(correction(P + 77))
+    round_.judge(verdict(P + 78))
+    assert not round_.wants(correction(P + 79)), "two are enough"
+    round_.keep(correction(P + 78))
     assert round_.complete
+
+
+@pytest.mark.parametrize(
+    ("seed", "given", "problem"),
+    [
+        (P + 2, {"situation": {}}, "its situation is not the one of the seed"),
+        (P + 2, {"situation": dict(TASK.sample(P + 3))}, "its situation is not the one of"),
+        (P + 2, {"situation": {**TASK.sample(P + 2), "object_y_m": 1e12}}, "its situation"),
+        (70, {}, "its seed 70 is none of practice"),
+    ],
+)
+def test_verdicts_that_cannot_be_true_are_ignored(
+    seed: int, given: dict[str, Any], problem: str
+) -> None:
+    round_ = make_round()
+    assert problem in round_.judge(replace(verdict(seed), **given))
+    assert round_.judge(verdict(P + 4)) == ""
+    assert round_.judged == 1
+    assert [asked.seed for asked in ask_all(round_)] == [P + 4]
+
+
+def test_the_failure_of_an_actor_that_was_not_asked_is_ignored(
+    failure: Callable[..., EpisodeFailed],
+) -> None:
+    round_ = make_round(choose="tutored")
+    assert ask(round_, "a") is not None
+    policy = {"kind": Kind.CORRECTION, "training": "training", "policy_version": 7}
+    for attempt in range(2 * TRIES):
+        assert not round_.fail(failure(f"{attempt}", actor="stranger", **policy))
+    assert ask(round_, "b") != ask(round_, "c"), "the first situation is still leased"

@@ -116,7 +116,9 @@ def test_a_case_whose_simulation_fails_repeatedly_is_given_up(
     plan = curriculum(cases=(0,), repeats=2)
     for attempt in range(TRIES):
         assert plan.next_case("a") == case(0, 0)
-        report = failure(f"report{attempt}", seed=0)
+        report = failure(f"report{attempt}", actor="a", seed=0)
+        for number in range(TRIES):  # of an actor that was not asked
+            assert not plan.fail(failure(f"{attempt}-{number}", actor="stranger", seed=0))
         given_up = plan.fail(report)
         assert given_up == (attempt == TRIES - 1)
         if not given_up:

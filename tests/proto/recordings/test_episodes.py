@@ -117,7 +117,7 @@ def test_every_field_is_read_back_exactly(
         assert same(getattr(again, item.name), getattr(episode, item.name)), item.name
     summary = read_summary(path)
     for item in fields(EpisodeSummary):
-        assert getattr(summary, item.name) == getattr(episode, item.name)
+        assert same(getattr(summary, item.name), getattr(episode, item.name)), item.name
 
 
 def test_an_episode_without_states_has_no_states_in_its_file(
@@ -239,7 +239,7 @@ def test_a_flipped_byte_is_refused_or_harmless(
         assert same(getattr(again, item.name), getattr(episode, item.name)), item.name
     summary = read_summary(path)
     for item in fields(EpisodeSummary):
-        assert getattr(summary, item.name) == getattr(episode, item.name)
+        assert same(getattr(summary, item.name), getattr(episode, item.name)), item.name
 
 
 def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
