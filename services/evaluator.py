@@ -7,8 +7,10 @@ import time
 from collections.abc import Iterable, Mapping
 from typing import Final
 
+from learner.tutoring.failures import Failures
 from proto.bus import Bus, Inbox
 from proto.config import Config
+from proto.disk_waits import when_disk_allows
 from proto.episode import Episode, Kind, Outcome
 from proto.keys import Role
 from proto.leases import Leases
@@ -52,6 +54,7 @@ class Evaluator:
         self._leases: Leases[tuple[PolicyKey, int]] = Leases(config.evaluator.lease_s)
         first = config.evaluator.seed
         self._seeds = range(first, first + config.evaluator.trials_per_policy)
+        self._failures: Failures[tuple[PolicyKey, int]] = Failures()
         self._newest: PolicyKey = ("", 0)
 
     def run(self) -> None:
@@ -84,6 +87,7 @@ class Evaluator:
                 for version in self._log.versions(run_id)
             ),
             leases=len(self._leases),
+            damaged=self._log.damaged,
             paused=self._lifecycle.paused,
             done=self._done,
         )
@@ -122,13 +126,14 @@ class Evaluator:
 
     def _receive(self, inbox: Inbox[Rollout]) -> None:
         rollout = inbox.take(timeout_s=IDLE_S)
+        self._lifecycle.waits_for("" if rollout else self._missing)
         if rollout is None:
             return
         episode = rollout.episode
         refusal = self._refusal(episode)
         if not refusal and episode.kind is Kind.TRIAL:
             self._leases.finish(((rollout.run_id, episode.policy_version), episode.seed))
-            if self._log.add(rollout):
+            if when_disk_allows(self._lifecycle, lambda: self._log.add(rollout)):
                 _report_trial(episode.policy_version, episode.seed, episode.outcome.reason)
         elif not refusal:
             self._bus.deliver(self._bus.keys.verdict, _verdict(rollout))
@@ -141,10 +146,25 @@ class Evaluator:
                 continue
             refusal = self._refusal(report)
             if not refusal:
-                self._leases.finish(((report.training, report.policy_version), report.seed))
-                if self._log.add_failure(report):
+                trial = (report.training, report.policy_version), report.seed
+                self._leases.finish(trial)
+                # Otherwise the trial is handed out again.
+                if self._failures.add(trial, report.id) and self._count_failure(report):
                     _report_trial(report.policy_version, report.seed, report.problem)
             self._answer(report.actor, Receipt(report.id, refusal))
+
+    def _count_failure(self, report: EpisodeFailed) -> bool:
+        return when_disk_allows(self._lifecycle, lambda: self._log.add_failure(report))
+
+    @property
+    def _missing(self) -> str:
+        """What it waits for while no rollout arrives."""
+        if self._bus.hub_is_away:
+            return "the hub"
+        if not self._newest[1]:
+            return "a policy"
+        left = len(self._seeds) - len(self._counted(self._newest))
+        return f"{left} trials of policy {self._newest[1]}" if left else "the next policy"
 
     def _refusal(self, played: Episode | EpisodeFailed) -> str:
         """Why an episode is no trial and no practice of this run; empty if it is one."""
@@ -159,7 +179,7 @@ class Evaluator:
         return ""
 
     def _answer(self, actor: str, receipt: Receipt) -> None:
-        self._bus.deliver(self._bus.keys.receipt(actor), receipt)
+        self._bus.deliver(self._bus.keys.receipt(Role.EVALUATOR, actor), receipt)
 
     def _counted(self, policy: PolicyKey) -> Mapping[int, Outcome]:
         outcomes = self._log.outcomes(*policy)

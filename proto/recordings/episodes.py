@@ -202,6 +202,21 @@ def read_summary(path: Path) -> EpisodeSummary:
     return summary
 
 
+def read_kind(path: Path) -> Kind:
+    """Read why an episode was played; only the beginning of the file is read.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        for record in records(path):
+            if isinstance(record, Metadata) and record.name == "episode":
+                return Kind(record.metadata["kind"])
+    except DAMAGE as error:
+        raise _not_an_episode(path, error) from error
+    raise _not_an_episode(path, ValueError("it does not say what it is"))
+
+
 def records(path: Path) -> Iterator[McapRecord]:
     """Yield all records of an MCAP file in order; unpack chunks and verify checksums.
 

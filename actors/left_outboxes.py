@@ -1,0 +1,99 @@
+"""Outboxes of actors that are gone for good: another actor of the run sends what is in them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+from proto.bus import Bus
+from proto.errors import UserError
+from proto.keys import Role
+from proto.messages import Receipt
+from proto.outbox import Outbox
+from proto.run_locks import only_one
+
+LOG = logging.getLogger(__name__)
+
+LOOK_EVERY_S: Final = 30.0
+OUTBOXES: Final = ("sequences", "rollouts")
+RECEIVERS: Final = (Role.LEARNER, Role.EVALUATOR, Role.RECORDER)
+
+
+def on_receipt(outboxes: list[Outbox], role: Role) -> Callable[[Receipt], None]:
+    """What to do with a receipt from a process of a role."""
+
+    def answer(receipt: Receipt) -> None:
+        for outbox in outboxes:
+            if receipt.refusal:
+                outbox.refused(receipt.episode, receipt.refusal)
+            else:
+                outbox.received(receipt.episode, role)
+
+    return answer
+
+
+class LeftOutboxes:
+    """Sends the messages of actors whose processes do not run any more, as in a run that moved.
+
+    It holds the lock of such an actor, so that no new process has its id meanwhile.
+    """
+
+    def __init__(self, run_folder: Path, bus: Bus) -> None:
+        """Look in a run's folder for the outboxes of others."""
+        self._run_folder = run_folder
+        self._bus = bus
+        self._held: dict[str, tuple[ExitStack, list[Outbox]]] = {}
+        self._listens_for: set[str] = set()
+
+    def __len__(self) -> int:
+        return sum(len(outbox) for _, outboxes in self._held.values() for outbox in outboxes)
+
+    def look(self) -> None:
+        """Find outboxes, send what is due, and let go of those that are empty."""
+        folders = (self._run_folder / "outbox").glob("*")
+        others = {each.name for each in folders if any(each.glob("*/*.message"))}
+        others -= {self._bus.id, *self._held}
+        if others:
+            others -= self._bus.present(Role.ACTOR)
+        for name in sorted(others):
+            self._take(name)
+        for name, (lock, outboxes) in list(self._held.items()):
+            for outbox in outboxes:
+                outbox.send_due()
+            if not any(map(len, outboxes)):
+                del self._held[name]
+                lock.close()
+
+    def close(self) -> None:
+        """Let go of all outboxes."""
+        for lock, _ in self._held.values():
+            lock.close()
+
+    def _take(self, name: str) -> None:
+        lock = ExitStack()
+        try:
+            lock.enter_context(only_one(self._run_folder, Role.ACTOR, name))
+        except UserError:  # its process runs, on this machine, and is not connected
+            return
+        folder = self._run_folder / "outbox" / name
+        outboxes = [Outbox(folder / each, self._send_as(name)) for each in OUTBOXES]
+        if name not in self._listens_for:
+            self._listens_for.add(name)
+            for role in RECEIVERS:
+                key = self._bus.keys.receipt(role, name)
+                self._bus.subscribe(key, self._on_receipt(name, role), Receipt)
+        self._held[name] = lock, outboxes
+        LOG.info("sends the %d messages that actor %s left behind", sum(map(len, outboxes)), name)
+
+    def _send_as(self, name: str) -> Callable[..., None]:
+        return lambda key, wire: self._bus.deliver_wire(self._bus.keys.renamed(key, name), wire)
+
+    def _on_receipt(self, name: str, role: Role) -> Callable[[Receipt], None]:
+        def answer(receipt: Receipt) -> None:
+            if (held := self._held.get(name)) is not None:
+                on_receipt(held[1], role)(receipt)
+
+        return answer
