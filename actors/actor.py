@@ -131,7 +131,9 @@ class Actor:
             self._tasks[first] = make_task(config.task_called(first))
         self._simulator = make_simulator(config.simulator)
         folder = config.run_folder / "outbox" / bus.id
-        self._sequences, self._rollouts = (Outbox(folder / each, self._deliver) for each in OUTBOXES)
+        self._sequences, self._rollouts = (
+            Outbox(folder / each, self._deliver) for each in OUTBOXES
+        )
         self._left = LeftOutboxes(config.run_folder, bus)
         keys = bus.keys
         self._ask_learner = Inquiry[TutoringRequest, TutoringCase | Correction](

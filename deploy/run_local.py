@@ -105,7 +105,9 @@ def _run(config: Config, actors: int, console: Console) -> None:
         highlight=False,
     )
     with Supervisor(programs(config, file, actors), logs) as supervisor:
-        watchdog = Watchdog(supervisor, lambda text: console.print(text, highlight=False))
+        watchdog = Watchdog(
+            supervisor, lambda text: console.print(text, highlight=False, soft_wrap=True)
+        )
         supervisor.start("hub")
         view = None
         with _connect(config, watchdog, lifecycle) or nullcontext() as bus:

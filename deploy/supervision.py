@@ -31,6 +31,8 @@ from services.arguments.process import HEARTBEAT_FILE
 START_WITHIN_S: Final = 20.0
 STUCK_AFTER_S: Final = 60.0
 """A process without a heartbeat for this time is killed."""
+FIRST_BEAT_WITHIN_S: Final = 300.0
+"""A process that starts on a busy machine needs time until its first heartbeat."""
 WELL_AFTER_S: Final = 60.0
 """A process that has run for this time is started again at once when it ends."""
 LONGEST_DELAY_S: Final = 60.0
@@ -199,8 +201,12 @@ class Supervisor:
         self._process = None
         self._socket_folder.cleanup()
 
+    def heartbeat_file(self, process: str) -> Path:
+        """The file that a process touches as long as it goes on."""
+        return self._heartbeats / process
+
     def _heartbeat_ns(self, process: str) -> int:
-        file = self._heartbeats / process
+        file = self.heartbeat_file(process)
         if not file.exists():
             file.touch()
         return file.stat().st_mtime_ns
@@ -254,6 +260,7 @@ class _Watched:
     Attributes:
         heartbeat_ns: its last heartbeat.
         beat_at_s: when the watchdog saw it (monotonic clock).
+        beats: whether it has had a heartbeat since its start.
         start_at_s: when it will be started again; None if it runs.
         delay_s: how long it waited for its last start.
         up_since_s: when the watchdog saw it run for the first time since its start.
@@ -261,6 +268,7 @@ class _Watched:
 
     heartbeat_ns: int
     beat_at_s: float
+    beats: bool = False
     start_at_s: float | None = None
     delay_s: float = 0.0
     up_since_s: float = 0.0
@@ -319,14 +327,17 @@ class Watchdog:
             if process.ended:
                 self._start_again(process, watched, now_s)
             elif beat != watched.heartbeat_ns:
-                watched.heartbeat_ns, watched.beat_at_s = beat, now_s
-            elif now_s - watched.beat_at_s > self._stuck_after_s:
+                watched.heartbeat_ns, watched.beat_at_s, watched.beats = beat, now_s, True
+            elif now_s - watched.beat_at_s > (limit_s := self._limit_s(watched)):
                 self._tell(
-                    f"{process.name} is stuck: no sign of life for {self._stuck_after_s:.0f} s. "
+                    f"{process.name} is stuck: no sign of life for {limit_s:.0f} s. "
                     f"It is killed and started again; see {process.log}"
                 )
                 self._supervisor.kill(process)
                 watched.beat_at_s = now_s
+
+    def _limit_s(self, watched: _Watched) -> float:
+        return self._stuck_after_s if watched.beats else FIRST_BEAT_WITHIN_S
 
     def _start_again(self, process: ProcessState, watched: _Watched, now_s: float) -> None:
         if watched.start_at_s is None:
@@ -338,6 +349,7 @@ class Watchdog:
             self._tell(f"{process.name} {how} and is started again {when}; see {process.log}")
         if now_s >= watched.start_at_s:
             watched.start_at_s = None
+            watched.beats = False
             watched.beat_at_s = watched.up_since_s = now_s
             self._supervisor.start_again(process)
 

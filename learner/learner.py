@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import logging
+import re
 import secrets
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
-from learner.checkpoint import load_checkpoint, policy_file, pretraining_file, training_file
+from learner.checkpoint import (
+    CheckpointMetadata,
+    checkpoint_from_bytes,
+    policy_file,
+    pretraining_file,
+    previous_training_file,
+    training_file,
+)
 from learner.training.training_run import (
     open_training,
     policy_is_due,
     pretraining_is_over,
+    save_training,
     write_policy,
 )
 from learner.training.vmdnn_recipe import VMDNNRecipe
@@ -25,7 +35,9 @@ from learner.tutoring.failures import TRIES, Shown
 from learner.tutoring.store import TutoringStore
 from proto.bus import Bus, Inbox
 from proto.config import Config
+from proto.disk_waits import when_disk_allows
 from proto.episode import Kind
+from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import alone_in_run, membership
@@ -41,7 +53,7 @@ from proto.messages import (
 )
 from proto.metrics import LearnerMetrics, Stage
 from proto.pace import Pace
-from proto.storage import written_whole
+from proto.storage import change_suffix, rename, written_whole
 
 LOG = logging.getLogger(__name__)
 
@@ -112,6 +124,9 @@ class Learner:
         )
         self._training = threading.Lock()  # held while the trainer changes or is written to disk
         self._run_id = _run_id(self._folder)
+        self._damaged = 0
+        self._published: tuple[int, CheckpointMetadata, bytes] | None = None
+        self._find_newest_policy()
         self._round = self._make_round()
         self._given_up = 0
         for store in self._stores.values():
@@ -126,7 +141,7 @@ class Learner:
             UserError: the run has a learner already, the training diverged, or the disk is full.
         """
         alone_in_run(self._bus, self._lifecycle)
-        self._config.save(self._folder / "config.yaml")
+        self._write(lambda: self._config.save(self._folder / "config.yaml"))
         self._publish()
         keys = self._bus.keys
         sequences = self._bus.inbox(keys.sequence(), Sequence, capacity=WAITING)
@@ -135,6 +150,7 @@ class Learner:
         with membership(self._bus, self, self._lifecycle):
             while not self._lifecycle.stopping:
                 may_train = self._may_train
+                self._lifecycle.waits_for("" if may_train else self._missing)
                 self._receive(sequences, wait_s=0.0 if may_train else IDLE_S)
                 self._receive_failures(failures)
                 if may_train:
@@ -156,19 +172,41 @@ class Learner:
             round=self._trainer.round,
             corrections=awaited.kept if awaited else 0,
             corrections_total=awaited.most if awaited else 0,
+            damaged=self._damaged + sum(len(store.damaged) for store in self._stores.values()),
             given_up=self._given_up,
             epochs_per_s=self._pace.per_second(),
-            policy_version=self._trainer.version,
+            policy_version=self._newest_version,
             paused=self._lifecycle.paused,
-            done=done.ever and self._trainer.version >= (done.policy_versions or 0),
+            done=done.ever and self._newest_version >= (done.policy_versions or 0),
         )
 
     def checkpoint(self) -> str:
         """Write the training to disk, after the epoch that is going on."""
-        path = training_file(self._folder)
         with self._training:
-            self._trainer.save(path)
-            return f"saved {self._trainer.stage} epoch {self._trainer.epochs_done} to {path}"
+            self._write(lambda: save_training(self._trainer, self._folder))
+            place = training_file(self._folder)
+            return f"saved {self._trainer.stage} epoch {self._trainer.epochs_done} to {place}"
+
+    def _write(self, write: Callable[[], None]) -> None:
+        """Write to disk; wait while the disk does not allow it."""
+        when_disk_allows(self._lifecycle, write)
+
+    @property
+    def _missing(self) -> str:
+        """What the learner waits for while it does not train."""
+        if self._lifecycle.paused:
+            return "the end of the pause"
+        if self._trainer.finished:
+            return ""
+        if (awaited := self._round) is not None:
+            wanted = f"corrections ({awaited.kept} of {awaited.most})"
+        else:
+            wanted = f"sequences ({self._sequences} so far)"
+        return f"the hub, then {wanted}" if self._bus.hub_is_away else wanted
+
+    @property
+    def _newest_version(self) -> int:
+        return self._published[0] if self._published else 0
 
     @property
     def _sequences(self) -> int:
@@ -232,12 +270,12 @@ class Learner:
         while (sequence := inbox.take(timeout_s=wait_s)) is not None:
             episode = sequence.episode
             if self._wants(episode):
-                self._stores[episode.task].add(episode)
+                when_disk_allows(self._lifecycle, partial(self._stores[episode.task].add, episode))
                 self._note(episode)
                 LOG.info("stored a %s sequence, %d in all", episode.kind, self._sequences)
             # A second demonstration of a case is not stored, but gets its receipt as well.
             receipt = Receipt(episode.id, self._refusal(episode))
-            self._bus.deliver(self._bus.keys.receipt(episode.actor), receipt)
+            self._answer(episode.actor, receipt)
             wait_s = 0.0
 
     def _receive_failures(self, inbox: Inbox[EpisodeFailed]) -> None:
@@ -251,7 +289,10 @@ class Learner:
                     "the %s of %s with the seed %d is given up, its simulation failed %d times: %s",
                     *(report.kind, report.task, report.seed, TRIES, report.problem),
                 )
-            self._bus.deliver(self._bus.keys.receipt(report.actor), Receipt(report.id))
+            self._answer(report.actor, Receipt(report.id))
+
+    def _answer(self, actor: str, receipt: Receipt) -> None:
+        self._bus.deliver(self._bus.keys.receipt(Role.LEARNER, actor), receipt)
 
     def _refusal(self, shown: Shown) -> str:
         """Why this learner will never store a sequence; empty if it might."""
@@ -280,7 +321,7 @@ class Learner:
         """The round of corrections that the next epoch has to wait for; None if there is none."""
         if not self._trainer.round_begins:
             return None
-        newest = self._run_id, self._trainer.version
+        newest = self._run_id, self._newest_version
         return Round(self._config, self._trainer.round, newest, self._situations)
 
     def _end_round(self) -> None:
@@ -300,25 +341,47 @@ class Learner:
             self._trainer.epoch()
             over = pretraining_is_over(self._trainer)
             if over:
-                self._trainer.save(pretraining_file(self._folder))
+                self._write(lambda: self._trainer.save(pretraining_file(self._folder)))
         self._pace.add()
         if policy_is_due(self._trainer):
             with self._training:
-                write_policy(self._trainer, self._folder)
+                self._write(lambda: write_policy(self._trainer, self._folder))
             # the training is on disk before its policy is published
             LOG.info(self.checkpoint())
+            self._find_newest_policy()
             self._round = self._make_round()
             self._publish()
         elif over or self._trainer.epochs_done % self._config.learner.checkpoint_every_epochs == 0:
             LOG.info(self.checkpoint())
 
+    def _find_newest_policy(self) -> None:
+        """Read the newest policy of this training that can be read; set damaged ones aside."""
+        folder = policy_file(self._folder, 0).parent
+        if not training_file(self._folder).exists():  # an older checkpoint had to be used
+            versions = [int(p.stem) for p in folder.glob("*") if re.fullmatch("[0-9]{6}", p.stem)]
+            self._trainer.version = max([self._trainer.version, *versions])
+        for version in range(self._trainer.version, 0, -1):
+            path = policy_file(self._folder, version)
+            try:
+                content = path.read_bytes()
+                metadata = checkpoint_from_bytes(content, f"policy {path}").metadata
+            except OSError:  # it is gone, or was set aside
+                continue
+            except UserError as error:
+                self._damaged += 1
+                aside = change_suffix(path, ".damaged")
+                LOG.warning("%s; it is kept as %s, and the one before is used", error, aside)
+                continue
+            self._published = metadata.version, metadata, content
+            break
+        if (held := self._newest_version) < self._trainer.version:
+            LOG.warning("policy %d is missing; policy %d is used", self._trainer.version, held)
+
     def _publish(self) -> None:
         """Publish the newest policy version, if there is any."""
-        version = self._trainer.version
-        if version == 0:
+        if self._published is None:
             return
-        path = policy_file(self._folder, version)
-        metadata = load_checkpoint(path).metadata
+        version, metadata, content = self._published
         self._bus.publish_newest(
             self._bus.keys.policy,
             PolicyVersion(
@@ -327,7 +390,7 @@ class Learner:
                 epoch=metadata.epoch,
                 loss=metadata.loss or 0.0,
                 config_digest=metadata.config_digest,
-                weights=path.read_bytes(),
+                weights=content,
             ),
         )
         LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
@@ -338,14 +401,27 @@ def _stores(config: Config) -> Mapping[str, TutoringStore]:
     folders = {config.task.name: "tutoring"}
     if config.pretraining_task is not None:
         folders[config.pretraining_task] = "pretraining"
-    return {task: TutoringStore(config.run_folder / name) for task, name in folders.items()}
+    return {
+        task: TutoringStore(config.run_folder / name, sets_aside=True)
+        for task, name in folders.items()
+    }
 
 
 def _run_id(folder: Path) -> str:
-    """Id of the training in a run's folder; a training that starts anew gets a new one."""
-    path = training_file(folder).with_name("run_id")
-    if training_file(folder).exists() and path.exists():
-        return path.read_text()
+    """Id of the training in a run's folder; a training that starts anew gets a new one.
+
+    The policies of the former training are moved to another folder.
+    """
+    path, policies = training_file(folder).with_name("run_id"), policy_file(folder, 0).parent
+    before = path.read_text().strip() if path.exists() else ""
+    if training_file(folder).exists() or previous_training_file(folder).exists():
+        if re.fullmatch("[0-9a-f]{1,64}", before):
+            return before
+        LOG.warning("%s does not hold the id of the training; it gets a new one", path)
+    elif any(policies.glob("*")):
+        moved = policies.with_name(f"policies-{secrets.token_hex(4)}")
+        rename(policies, moved)
+        LOG.warning("the training starts anew; the policies of the former one are in %s", moved)
     run_id = secrets.token_hex(8)
     with written_whole(path) as stream:
         stream.write(run_id.encode())

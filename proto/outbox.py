@@ -1,4 +1,4 @@
-"""Messages that must arrive: kept on disk until all receivers have answered, and sent until then."""
+"""Messages that must arrive: kept on disk, and sent again until all receivers have answered."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ class Outbox:
     Messages that were sent least often go first, the oldest of them first: messages that nobody
     answers, such as those of another version, do not hold up the others.
 
-    A file is one line of JSON with key, encoding and receivers, followed by the payload. Used by several
-    threads.
+    A file is one line of JSON with key, encoding and receivers, followed by the payload. Used by
+    several threads.
     """
 
     def __init__(

@@ -15,7 +15,6 @@ from proto.errors import UserError
 from proto.keys import Role
 from proto.storage import make_folder, storage_errors
 
-
 LOG = logging.getLogger(__name__)
 
 

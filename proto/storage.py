@@ -112,6 +112,27 @@ def make_folder(folder: Path) -> None:
             _sync_folder(made.parent)
 
 
+def link_file(path: Path, other: Path) -> None:
+    """Make `other` a second name of a file, which keeps its content when `path` is replaced.
+
+    On a file system without links it becomes a copy.
+
+    Raises:
+        DiskFullError: no space is left.
+        StorageError: it cannot be made for another reason.
+    """
+    part = other.with_name(f"{other.name}.{secrets.token_hex(4)}.part")
+    with storage_errors(other):
+        try:
+            os.link(path, part)
+        except OSError:
+            with written_whole(other) as stream, path.open("rb") as source:
+                shutil.copyfileobj(source, stream)
+            return
+        part.replace(other)
+        _sync_folder(other.parent)
+
+
 def delete_file(path: Path) -> None:
     """Delete a file; a missing one is ignored.
 
@@ -129,10 +150,19 @@ def change_suffix(path: Path, suffix: str) -> Path:
         StorageError: there is no such file, or it cannot be renamed.
     """
     renamed = path.with_suffix(suffix)
+    rename(path, renamed)
+    return renamed
+
+
+def rename(path: Path, renamed: Path) -> None:
+    """Give a file or a folder another name.
+
+    Raises:
+        StorageError: it does not exist, or cannot be renamed.
+    """
     with storage_errors(renamed):
         path.rename(renamed)
         _sync_folder(renamed.parent)
-    return renamed
 
 
 @contextmanager

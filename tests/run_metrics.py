@@ -23,8 +23,8 @@ ACTOR = ActorMetrics(
 )  # fmt: skip
 LEARNER = LearnerMetrics(
     id="l", time_s=1.0, refused=0, stage=Stage.COUPLED, epoch=120, epochs_total=2500, loss=0.4321,
-    sequences=45, round=0, corrections=0, corrections_total=0, given_up=0, epochs_per_s=12.5,
-    policy_version=3, paused=False, done=False,
+    sequences=45, round=0, corrections=0, corrections_total=0, damaged=0, given_up=0,
+    epochs_per_s=12.5, policy_version=3, paused=False, done=False,
 )  # fmt: skip
 
 
@@ -40,7 +40,7 @@ def score(version: int, strict: int, trials: int) -> PolicyScore:
 
 EVALUATOR = EvaluatorMetrics(
     id="e", time_s=1.0, refused=0, policies=(score(2, 3, 10), score(3, 44, 52)), leases=1,
-    paused=False, done=False,
+    damaged=0, paused=False, done=False,
 )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ports import free_endpoint
-from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
+from processes import eventually, listening_hub, stop, vmdnn
 
 from actors.tasks.experiment1.plan import plan
 from actors.tasks.registry import make_task
@@ -88,6 +88,7 @@ class ActorSetup:
         self.metrics: ActorMetrics | None = None
         self.failures: list[EpisodeFailed] = []
         self.gives_receipts = True
+        self.recorders = [Role.RECORDER]
         self.refusal = ""
         self.hub: Popen[bytes]
         self.actor: Popen[bytes]
@@ -136,23 +137,24 @@ class ActorSetup:
 
     def _on_sequence(self, sequence: Sequence) -> None:
         self.sequences.append(sequence.episode)
-        self._acknowledge(sequence.episode)
+        self._acknowledge(sequence.episode, Role.LEARNER)
 
     def _on_rollout(self, rollout: Rollout) -> None:
         self.rollouts.append(rollout)
-        self._acknowledge(rollout.episode)
+        self._acknowledge(rollout.episode, Role.EVALUATOR, *self.recorders)
 
     def _on_metrics(self, metrics: ActorMetrics) -> None:
         self.metrics = metrics
 
     def _on_failure(self, report: EpisodeFailed) -> None:
         self.failures.append(report)
-        self.bus.deliver(self.bus.keys.receipt(report.actor), Receipt(report.id))
+        role = Role.EVALUATOR if report.kind is Kind.TRIAL else Role.LEARNER
+        self.bus.deliver(self.bus.keys.receipt(role, report.actor), Receipt(report.id))
 
-    def _acknowledge(self, episode: Episode) -> None:
-        if self.gives_receipts:
+    def _acknowledge(self, episode: Episode, *roles: Role) -> None:
+        for role in roles if self.gives_receipts else ():
             receipt = Receipt(episode.id, self.refusal)
-            self.bus.deliver(self.bus.keys.receipt(episode.actor), receipt)
+            self.bus.deliver(self.bus.keys.receipt(role, episode.actor), receipt)
 
 
 @pytest.fixture
@@ -388,11 +390,3 @@ def test_when_stopped_it_aborts_its_episode_and_ends_cleanly(
     assert stop(setup.actor) == 0
     assert setup.rollouts == []
     assert setup.bus.present(Role.ACTOR) == set()
-
-
-def test_without_a_hub_it_prints_what_to_do(tmp_path: Path) -> None:
-    words = ("--connect", free_endpoint(), "--set", f"run.folder={tmp_path}")
-    ended = run_vmdnn("actor", *words)
-    assert ended.returncode == 2
-    assert "start one with `vmdnn hub`" in ended.stderr
-    assert "Traceback" not in ended.stderr

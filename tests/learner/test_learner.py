@@ -86,7 +86,7 @@ class LearnerSetup:
         keys = self.actor.keys
         self.actor.subscribe_newest(keys.policy, self.policies.append, PolicyVersion)
         self.actor.subscribe(keys.metrics(Role.LEARNER), self._listen, LearnerMetrics)
-        self.actor.subscribe(keys.receipt("actor"), self._receipts.append, Receipt)
+        self.actor.subscribe(keys.receipt(Role.LEARNER, "actor"), self._receipts.append, Receipt)
         self.process: Popen[bytes]
 
     def start(self, *more: str) -> None:
