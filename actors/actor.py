@@ -169,6 +169,7 @@ class Actor:
                 every(OUTBOX_PERIOD_S, self._rollouts.send_due),
                 every(LOOK_EVERY_S, self._left.look),
             ):
+                self._left.look()
                 while not self._lifecycle.stopping:
                     self._play_next()
         finally:

@@ -58,14 +58,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_can_be_done(config)
         if trouble := port_trouble(config.hub.endpoint):
             raise UserError(trouble)
-        run(config, actors, Console())
+        run(config, actors, RunConsole())
     except (UserError, ProcessFailedError) as error:
         print(f"run_local: {error}", file=sys.stderr)
         return BAD_INPUT
     except SupervisorEndedError as error:
         print(f"run_local: {error}; the same command continues the run", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:  # before signals were handled: nothing was started
+        return 130
     return 0
+
+
+class RunConsole(Console):
+    """A console whose reader may end: the run goes on."""
+
+    def on_broken_pipe(self) -> None:
+        """Print nothing more."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def default_actors() -> int:

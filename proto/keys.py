@@ -68,7 +68,7 @@ class Keys:
         """Actor to learner and evaluator: `EpisodeFailed`."""
         return f"vmdnn/{self.run}/failure/{actor}"
 
-    def receipt(self, role: Role, actor: str) -> str:
+    def receipt(self, role: Role | str, actor: str) -> str:
         """Learner, evaluator or recorder (`role`) to actor: `Receipt`."""
         return f"vmdnn/{self.run}/receipt/{role}/{actor}"
 

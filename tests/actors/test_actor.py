@@ -23,9 +23,10 @@ from learner.training.trainer import Trainer
 from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.store import TutoringStore
 from proto.bus import Bus, open_bus
+from proto.codec import encode
 from proto.config import Config, HubConfig, LearnerConfig, PretrainingConfig, TaskConfig
 from proto.episode import Episode, Kind
-from proto.keys import Role
+from proto.keys import Keys, Role
 from proto.messages import (
     Command,
     Control,
@@ -43,7 +44,7 @@ from proto.messages import (
     TutoringRequest,
 )
 from proto.metrics import ActorMetrics
-from proto.outbox import IN_FLIGHT
+from proto.outbox import IN_FLIGHT, Outbox
 from proto.seeds import PRACTICE
 
 MakeEpisode = Callable[..., Episode]
@@ -390,3 +391,35 @@ def test_when_stopped_it_aborts_its_episode_and_ends_cleanly(
     assert stop(setup.actor) == 0
     assert setup.rollouts == []
     assert setup.bus.present(Role.ACTOR) == set()
+
+
+def test_what_a_renamed_or_moved_run_left_in_its_outboxes_arrives(
+    setup: ActorSetup, make_episode: MakeEpisode
+) -> None:
+    """The keys are those of the run's former name; one actor does not exist any more."""
+    for actor in ("actor-1", "of-another-host-1"):
+        left = Outbox(setup.outbox.parent / actor / "sequences", lambda *_: None)
+        for number in range(IN_FLIGHT):
+            episode = make_episode(20, id=f"{actor}-{number}", actor=actor)
+            key = Keys("former-name").sequence(actor)
+            left.add(episode.id, key, encode(Sequence(episode)), [Role.LEARNER])
+    setup.start_actor()
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
+    arrived = {episode.id for episode in setup.sequences}
+    assert len(arrived) == 2 * IN_FLIGHT
+    assert not list(setup.outbox.parent.glob("*/*/*"))
+
+
+def test_a_rollout_stays_until_the_recorder_has_it_too(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    setup.recorders.clear()
+    setup.trials.append(Trial(seed=1234))
+    setup.publish(policy(1))
+    setup.start_actor("--set", "actor.practice=false")
+    eventually(lambda: len(setup.rollouts) == 1, "a trial")
+    eventually(lambda: len(setup.rollouts) == 2, "it is sent again")
+    metrics = setup.wait_for_metrics(lambda metrics: bool(metrics.waiting_for))
+    assert (metrics.outbox, metrics.waiting_for) == (1, "receipts of the recorder")
+    setup.recorders.append(Role.RECORDER)
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)

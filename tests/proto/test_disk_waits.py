@@ -29,7 +29,7 @@ def test_it_goes_on_when_there_is_room(tiny_disk: Path, caplog: pytest.LogCaptur
     filler.write_bytes(bytes(60 * 1024 - 4096 * 2))
     lifecycle = Lifecycle()
     lifecycle.waits_for("a trial")
-    line = b"x" * 9000 + b"\n"
+    line = b"x" * 20_000 + b"\n"
     writer = threading.Thread(
         target=when_disk_allows, args=(lifecycle, lambda: append_line(log, line))
     )
