@@ -10,6 +10,7 @@ import contextlib
 import os
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -29,6 +30,8 @@ from proto.storage import written_whole
 from services.arguments.process import HEARTBEAT_FILE
 
 START_WITHIN_S: Final = 20.0
+ANSWER_WITHIN_S: Final = 10.0
+"""Time in which supervisord must answer a request."""
 STUCK_AFTER_S: Final = 60.0
 """A process without a heartbeat for this time is killed."""
 FIRST_BEAT_WITHIN_S: Final = 300.0
@@ -36,7 +39,7 @@ FIRST_BEAT_WITHIN_S: Final = 300.0
 WELL_AFTER_S: Final = 60.0
 """A process that has run for this time is started again at once when it ends."""
 LONGEST_DELAY_S: Final = 60.0
-_LATE_S: Final = 5.0
+_LATE_S: Final = 30.0
 _SOCKET_PATH_BYTES: Final = 100
 BAD_INPUT: Final = 2
 """Exit status for bad input; a process that ends with it is not started again."""
@@ -78,7 +81,8 @@ class ProcessState:
         started_s: time of its last start (Unix time), 0 if it was not started.
         exit_status: exit status of the last process of this name that ended; -1 after a signal.
         log: file with its output.
-        heartbeat_ns: when it touched its heartbeat file last (Unix time).
+        heartbeat_ns: when it touched its heartbeat file last (Unix time); None if that cannot be
+            known.
     """
 
     name: str
@@ -88,7 +92,7 @@ class ProcessState:
     started_s: int
     exit_status: int
     log: Path
-    heartbeat_ns: int = 0
+    heartbeat_ns: int | None = None
 
     @property
     def ended(self) -> bool:
@@ -120,16 +124,14 @@ class Supervisor:
         self.programs = programs
         self._folder = folder.resolve()
         self._process: subprocess.Popen[bytes] | None = None
-        self._pids: set[int] = set()
 
     def __enter__(self) -> Self:
         self._socket_folder = _short_folder()
-        socket = Path(self._socket_folder.name) / "socket"
-        self._heartbeats = socket.parent
+        self._socket = Path(self._socket_folder.name) / "socket"
+        self._heartbeats = self._socket.parent
         config = self._folder / "supervisord.conf"
         with written_whole(config) as stream:
-            stream.write(supervisord_config(self.programs, self._folder, socket).encode())
-        self._socket = socket
+            stream.write(supervisord_config(self.programs, self._folder, self._socket).encode())
         self._process = subprocess.Popen(
             (*_DIES_WITH_PARENT, sys.executable, "-m", "supervisor.supervisord", "-c", config),
             stdin=subprocess.DEVNULL,
@@ -170,7 +172,7 @@ class Supervisor:
         Raises:
             SupervisorEndedError: supervisord has ended.
         """
-        states = [
+        return [
             ProcessState(
                 name=info["name"],
                 group=info["group"],
@@ -183,21 +185,18 @@ class Supervisor:
             )
             for info in self._ask("getAllProcessInfo")
         ]
-        self._pids = {state.pid for state in states if state.pid}
-        return states
 
     def stop(self) -> None:
         """Stop all processes and wait until they have ended; further calls do nothing."""
         if self._process is None:
             return
-        if self._process.poll() is not None:
-            self._kill_orphans()
         self._process.terminate()
         try:
             self._process.wait(timeout=sum(p.stop_within_s for p in self.programs) + 10)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._end_orphans()
         self._process = None
         self._socket_folder.cleanup()
 
@@ -205,23 +204,43 @@ class Supervisor:
         """The file that a process touches as long as it goes on."""
         return self._heartbeats / process
 
-    def _heartbeat_ns(self, process: str) -> int:
+    def _heartbeat_ns(self, process: str) -> int | None:
         file = self.heartbeat_file(process)
-        if not file.exists():
-            file.touch()
-        return file.stat().st_mtime_ns
+        try:
+            if not file.exists():
+                file.touch()
+            return file.stat().st_mtime_ns
+        except OSError:  # such as a full disk
+            return None
 
-    def _kill_orphans(self) -> None:
-        """Kill what supervisord left: processes that were frozen when they were asked to end."""
-        for pid in self._pids:
-            with contextlib.suppress(OSError):
-                environment = Path(f"/proc/{pid}/environ").read_bytes()
-                if str(self._heartbeats).encode() in environment:
-                    os.kill(pid, signal.SIGKILL)
+    def _end_orphans(self) -> None:
+        """Wait for processes that supervisord left behind, and kill those that do not end.
+
+        They got SIGTERM when supervisord died.
+        """
+        deadline = time.monotonic() + max((p.stop_within_s for p in self.programs), default=0)
+        while orphans := self._children():
+            if time.monotonic() > deadline:
+                for pid in orphans:
+                    with contextlib.suppress(OSError):
+                        os.kill(pid, signal.SIGKILL)
+                return
+            time.sleep(0.1)
+
+    def _children(self) -> list[int]:
+        """Living processes that this supervisor started; the path in their environment tells."""
+        mark, found = str(self._heartbeats).encode(), []
+        for environment in Path("/proc").glob("[0-9]*/environ"):
+            with contextlib.suppress(OSError):  # it has just ended, or is somebody else's
+                if mark in environment.read_bytes():
+                    found.append(int(environment.parent.name))
+        return found
 
     def _ask(self, method: str, *arguments: object) -> Any:
         # A transport cannot be used again after a failure, so each request makes a new one.
         transport = SupervisorTransport(serverurl=f"unix://{self._socket}")
+        default_s = socket.getdefaulttimeout()
+        socket.setdefaulttimeout(ANSWER_WITHIN_S)  # the transport has no option for it
         try:
             with ServerProxy("http://supervisord", transport) as supervisord:
                 return getattr(supervisord.supervisor, method)(*arguments)
@@ -231,6 +250,8 @@ class Supervisor:
             raise SupervisorEndedError(
                 "supervisord was killed, and its processes were stopped with it"
             ) from error
+        finally:
+            socket.setdefaulttimeout(default_s)
 
     def _ask_for(self, process: ProcessState, method: str, *arguments: object) -> None:
         # The state may have changed since it was looked at: then supervisord answers with a fault.
@@ -266,7 +287,7 @@ class _Watched:
         up_since_s: when the watchdog saw it run for the first time since its start.
     """
 
-    heartbeat_ns: int
+    heartbeat_ns: int | None
     beat_at_s: float
     beats: bool = False
     start_at_s: float | None = None
@@ -301,7 +322,7 @@ class Watchdog:
         self._stuck_after_s = stuck_after_s
         self._clock = clock
         self._watched: dict[str, _Watched] = {}
-        self._looked_at_s = clock()
+        self._looked_at_s = self._answered_at_s = clock()
 
     def look(self) -> None:
         """Look after all processes; called about once a second.
@@ -312,32 +333,40 @@ class Watchdog:
         """
         now_s = self._clock()
         # Someone who was frozen cannot know how long the others were silent.
-        away_s = now_s - self._looked_at_s if now_s - self._looked_at_s > _LATE_S else 0.0
+        late_s = now_s - self._looked_at_s
+        if late_s > _LATE_S:
+            self._answered_at_s += late_s
+            for watched in self._watched.values():
+                watched.beat_at_s += late_s
         self._looked_at_s = now_s
-        for process in self._supervisor.processes():
-            if process.cannot_work:
-                raise ProcessFailedError(process, "cannot work and is not started again")
-            if not process.started_s:
-                continue
-            beat = process.heartbeat_ns
-            watched = self._watched.setdefault(
-                process.name, _Watched(beat, now_s, up_since_s=now_s)
-            )
-            watched.beat_at_s += away_s
-            if process.ended:
-                self._start_again(process, watched, now_s)
-            elif beat != watched.heartbeat_ns:
-                watched.heartbeat_ns, watched.beat_at_s, watched.beats = beat, now_s, True
-            elif now_s - watched.beat_at_s > (limit_s := self._limit_s(watched)):
-                self._tell(
-                    f"{process.name} is stuck: no sign of life for {limit_s:.0f} s. "
-                    f"It is killed and started again; see {process.log}"
-                )
-                self._supervisor.kill(process)
-                watched.beat_at_s = now_s
+        try:
+            for process in self._supervisor.processes():
+                self._look_at(process, now_s)
+        except (OSError, HTTPException) as error:  # it may answer again
+            if now_s - self._answered_at_s > self._stuck_after_s:
+                raise SupervisorEndedError(f"supervisord does not answer ({error})") from error
+        else:
+            self._answered_at_s = now_s
 
-    def _limit_s(self, watched: _Watched) -> float:
-        return self._stuck_after_s if watched.beats else FIRST_BEAT_WITHIN_S
+    def _look_at(self, process: ProcessState, now_s: float) -> None:
+        if process.cannot_work:
+            raise ProcessFailedError(process, "cannot work and is not started again")
+        if not process.started_s:
+            return
+        beat = process.heartbeat_ns
+        watched = self._watched.setdefault(process.name, _Watched(beat, now_s, up_since_s=now_s))
+        limit_s = self._stuck_after_s if watched.beats else FIRST_BEAT_WITHIN_S
+        if process.ended:
+            self._start_again(process, watched, now_s)
+        elif beat != watched.heartbeat_ns or beat is None:
+            watched.heartbeat_ns, watched.beat_at_s, watched.beats = beat, now_s, True
+        elif now_s - watched.beat_at_s > limit_s:
+            self._tell(
+                f"{process.name} is stuck: no sign of life for {limit_s:.0f} s. It is killed and "
+                f"started again; see {process.log}"
+            )
+            self._supervisor.kill(process)
+            watched.beat_at_s = now_s
 
     def _start_again(self, process: ProcessState, watched: _Watched, now_s: float) -> None:
         if watched.start_at_s is None:
