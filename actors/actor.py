@@ -349,9 +349,9 @@ class Actor:
                 config_digest=self._digest,
                 on_step=on_step,
             )
+        except (_StoppedError, UserError, OSError, MemoryError):
+            raise  # nothing is wrong with the episode
         except Exception as error:
-            if isinstance(error, _StoppedError):
-                raise
             problem = f"{type(error).__name__}: {error}"
             if self._simulation_is_finite():
                 # The next process starts with a new simulator; the report is on disk before.

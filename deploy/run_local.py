@@ -114,6 +114,7 @@ def _run(config: Config, actors: int, console: Console) -> None:
         f"{'continuing' if exists else 'starting'} run {config.run.name} with {actors} "
         f"{'actor' if actors == 1 else 'actors'} in {config.run_folder}",
         highlight=False,
+        soft_wrap=True,
     )
     with Supervisor(programs(config, file, actors), logs) as supervisor:
         watchdog = Watchdog(

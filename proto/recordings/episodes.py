@@ -213,8 +213,8 @@ def read_kind(path: Path) -> Kind:
             if isinstance(record, Metadata) and record.name == "episode":
                 return Kind(record.metadata["kind"])
     except DAMAGE as error:
-        raise _not_an_episode(path, error) from error
-    raise _not_an_episode(path, ValueError("it does not say what it is"))
+        raise UserError(f"{path} is damaged ({error!r})") from error
+    raise UserError(f"{path} is no recording of an episode")
 
 
 def records(path: Path) -> Iterator[McapRecord]:

@@ -41,6 +41,8 @@ SETTINGS = {
     "learner.lease_s": 20.0,
     "evaluator.lease_s": 20.0,
     "evaluator.trials_per_policy": TRIALS,
+    "learner.corrections.rounds": 0,
+    "done": "{}",
 }
 VERSIONS = 10
 

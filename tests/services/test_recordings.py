@@ -70,4 +70,4 @@ def test_a_damaged_recording_is_kept_and_told(
     (tmp_path / "damaged.mcap").write_bytes(b"nothing")
     Recordings(tmp_path, KeepConfig(practice=0))
     assert names(tmp_path) == ["damaged"]
-    assert "damaged.mcap is not an MCAP file" in caplog.text
+    assert "damaged.mcap is damaged" in caplog.text
