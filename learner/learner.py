@@ -53,7 +53,7 @@ from proto.messages import (
 )
 from proto.metrics import LearnerMetrics, Stage
 from proto.pace import Pace
-from proto.storage import change_suffix, rename, written_whole
+from proto.storage import change_suffix, delete_file, parts_in, rename, written_whole
 
 LOG = logging.getLogger(__name__)
 
@@ -106,6 +106,7 @@ class Learner:
         self._bus = bus
         self._lifecycle = lifecycle
         self._folder = config.run_folder
+        _delete_unfinished_files(self._folder)
         tutored_cases = {name: len(task.tutored()) for name, task in tasks.items()}
         self._curriculum = Curriculum(config, tutored_cases)
         self._situations = tasks[config.task.name]
@@ -394,6 +395,14 @@ class Learner:
             ),
         )
         LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
+
+
+def _delete_unfinished_files(folder: Path) -> None:
+    """Delete what killed learners left half written; no other process writes to these folders."""
+    own = (folder / name for name in ("tutoring", "pretraining", "checkpoints", "policies"))
+    for place in (folder, *own):
+        for unfinished in parts_in(place):
+            delete_file(unfinished)
 
 
 def _stores(config: Config) -> Mapping[str, TutoringStore]:

@@ -94,9 +94,7 @@ class Recorder:
         self._bus.deliver(receipt, Receipt(episode.id))
 
     def _write(self, path: Path, episode: Episode) -> None:
-        when_disk_allows(
-            self._lifecycle, lambda: write_episode(path, episode, robot=self._robot)
-        )
+        when_disk_allows(self._lifecycle, lambda: write_episode(path, episode, robot=self._robot))
 
 
 def _robot() -> SceneUpdate | None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -196,6 +198,21 @@ def test_what_can_never_work_starts_nothing(
     assert main(["--set", f"run.folder={tmp_path}", *words]) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_goes_on_when_the_reader_of_its_output_ends() -> None:
+    script = (
+        "import sys\n"
+        "from deploy.run_local import RunConsole\n"
+        "console = RunConsole()\n"
+        "for _ in range(1000): console.print('x' * 1000)\n"
+        "print('went on', file=sys.stderr)\n"
+    )
+    command = f"{shlex.quote(sys.executable)} -c {shlex.quote(script)} | head -n 1"
+    ended = subprocess.run(
+        command, shell=True, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert ended.stderr == "went on\n"
 
 
 def pid_of(role: str, folder: Path) -> int:

@@ -152,5 +152,6 @@ def test_nothing_is_lost_by_random_faults(tmp_path: Path) -> None:
     log = "".join(path.read_text() for path in sorted((run.folder / "logs").glob("learner.log*")))
     published = [int(number) for number in re.findall(r"policy (\d+) is published", log)]
     assert published == sorted(published), "versions never go back"
-    left = [path for path in run.folder.rglob("*") if path.suffix in {".damaged", ".refused"}]
+    wrong = {".damaged", ".refused", ".part"}
+    left = [path for path in run.folder.rglob("*") if path.suffix in wrong]
     assert left == []

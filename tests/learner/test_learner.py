@@ -454,6 +454,8 @@ def test_damaged_checkpoint_policy_and_run_id_lose_no_version(setup: LearnerSetu
     training = training_file(setup.folder)
     training.write_bytes(b"damaged")
     training.with_name("run_id").write_bytes(b"")
+    half = training.with_name("training.safetensors.0123abcd.part")
+    half.touch()
 
     setup.policies.clear()
     setup.start()
@@ -463,4 +465,5 @@ def test_damaged_checkpoint_policy_and_run_id_lose_no_version(setup: LearnerSetu
     assert setup.policies[0].run_id != run_id, "the id of the training is lost"
     assert setup.wait_for_metrics(lambda metrics: metrics.damaged == 1).policy_version >= second
     assert newest.with_suffix(".damaged").read_bytes() == b"damaged"
+    assert not half.exists()
     assert {path: path.read_bytes() for path in published} == published
