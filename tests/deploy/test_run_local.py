@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
 import signal
 import socket
 import subprocess
@@ -204,15 +203,26 @@ def test_a_run_goes_on_when_the_reader_of_its_output_ends() -> None:
     script = (
         "import sys\n"
         "from deploy.run_local import RunConsole\n"
+        "sys.stdin.readline()\n"
         "console = RunConsole()\n"
-        "for _ in range(1000): console.print('x' * 1000)\n"
+        "for _ in range(3): console.print('nobody reads this')\n"
         "print('went on', file=sys.stderr)\n"
     )
-    command = f"{shlex.quote(sys.executable)} -c {shlex.quote(script)} | head -n 1"
-    ended = subprocess.run(
-        command, shell=True, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert ended.stderr == "went on\n"
+    with subprocess.Popen(
+        (sys.executable, "-c", script),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=ROOT,
+        text=True,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        process.stdin.write("the reader has ended\n")
+        process.stdin.close()
+        assert process.stderr.read() == "went on\n"
 
 
 def pid_of(role: str, folder: Path) -> int:
