@@ -38,7 +38,7 @@ FIRST_BEAT_WITHIN_S: Final = 300.0
 """A process that starts on a busy machine needs time until its first heartbeat."""
 WELL_AFTER_S: Final = 60.0
 """A process that has run for this time is started again at once when it ends."""
-LONGEST_DELAY_S: Final = 60.0
+LONGEST_DELAY_S: Final = 30.0
 _LATE_S: Final = 30.0
 _SOCKET_PATH_BYTES: Final = 100
 BAD_INPUT: Final = 2
