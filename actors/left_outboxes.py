@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,6 +19,8 @@ from proto.run_locks import only_one
 LOG = logging.getLogger(__name__)
 
 LOOK_EVERY_S: Final = 30.0
+GONE_AFTER_S: Final = 60.0
+"""An actor that was away for so long is gone for good; one that is restarted is back before."""
 OUTBOXES: Final = ("sequences", "rollouts")
 RECEIVERS: Final = (Role.LEARNER, Role.EVALUATOR, Role.RECORDER)
 
@@ -38,13 +41,22 @@ def on_receipt(outboxes: list[Outbox], role: Role) -> Callable[[Receipt], None]:
 class LeftOutboxes:
     """Sends the messages of actors whose processes do not run any more, as in a run that moved.
 
-    It holds the lock of such an actor, so that no new process has its id meanwhile.
+    Should such an actor come back nevertheless, both send its messages. The receivers store each
+    once, and the receipts delete them.
     """
 
-    def __init__(self, run_folder: Path, bus: Bus) -> None:
-        """Look in a run's folder for the outboxes of others."""
+    def __init__(self, run_folder: Path, bus: Bus, *, gone_after_s: float = GONE_AFTER_S) -> None:
+        """Look in a run's folder for the outboxes of others.
+
+        Args:
+            run_folder: the run's folder.
+            bus: sends the messages.
+            gone_after_s: how long an actor must have been away (s).
+        """
         self._run_folder = run_folder
         self._bus = bus
+        self._gone_after_s = gone_after_s
+        self._away_since_s: dict[str, float] = {}
         self._held: dict[str, tuple[ExitStack, list[Outbox]]] = {}
         self._listens_for: set[str] = set()
 
@@ -58,8 +70,11 @@ class LeftOutboxes:
         others -= {self._bus.id, *self._held}
         if others:
             others -= self._bus.present(Role.ACTOR)
-        for name in sorted(others):
-            self._take(name)
+        now_s = time.monotonic()
+        self._away_since_s = {name: self._away_since_s.get(name, now_s) for name in others}
+        for name, since_s in sorted(self._away_since_s.items()):
+            if now_s - since_s >= self._gone_after_s:
+                self._take(name)
         for name, (lock, outboxes) in list(self._held.items()):
             for outbox in outboxes:
                 outbox.send_due()
@@ -73,13 +88,15 @@ class LeftOutboxes:
             lock.close()
 
     def _take(self, name: str) -> None:
+        folder = self._run_folder / "outbox" / name
         lock = ExitStack()
         try:
-            lock.enter_context(only_one(self._run_folder, Role.ACTOR, name))
-        except UserError:  # its process runs, on this machine, and is not connected
+            lock.enter_context(only_one(self._run_folder, Role.WATCH, f"left-{name}"))
+            with only_one(self._run_folder, Role.ACTOR, name):
+                outboxes = [Outbox(folder / each, self._send_as(name)) for each in OUTBOXES]
+        except UserError:  # its process runs on this machine, or another actor sends them
+            lock.close()
             return
-        folder = self._run_folder / "outbox" / name
-        outboxes = [Outbox(folder / each, self._send_as(name)) for each in OUTBOXES]
         if name not in self._listens_for:
             self._listens_for.add(name)
             for role in RECEIVERS:

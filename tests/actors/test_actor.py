@@ -17,6 +17,7 @@ import pytest
 from ports import free_endpoint
 from processes import eventually, listening_hub, stop, vmdnn
 
+from actors.left_outboxes import LeftOutboxes
 from actors.tasks.experiment1.plan import plan
 from actors.tasks.registry import make_task
 from learner.training.trainer import Trainer
@@ -45,6 +46,7 @@ from proto.messages import (
 )
 from proto.metrics import ActorMetrics
 from proto.outbox import IN_FLIGHT, Outbox
+from proto.run_locks import own_id
 from proto.seeds import PRACTICE
 
 MakeEpisode = Callable[..., Episode]
@@ -393,21 +395,50 @@ def test_when_stopped_it_aborts_its_episode_and_ends_cleanly(
     assert setup.bus.present(Role.ACTOR) == set()
 
 
-def test_what_a_renamed_or_moved_run_left_in_its_outboxes_arrives(
+def leave_sequences(setup: ActorSetup, make_episode: MakeEpisode, actor: str) -> None:
+    """Put sequences into an actor's outbox, with the keys of a run of another name."""
+    left = Outbox(setup.outbox.parent / actor / "sequences", lambda *_: None)
+    for number in range(IN_FLIGHT):
+        episode = make_episode(20, id=f"{actor}-{number}", actor=actor)
+        key = Keys("former-name").sequence(actor)
+        left.add(episode.id, key, encode(Sequence(episode)), [Role.LEARNER])
+
+
+def test_what_a_renamed_run_left_in_its_outboxes_arrives(
     setup: ActorSetup, make_episode: MakeEpisode
 ) -> None:
-    """The keys are those of the run's former name; one actor does not exist any more."""
-    for actor in ("actor-1", "of-another-host-1"):
-        left = Outbox(setup.outbox.parent / actor / "sequences", lambda *_: None)
-        for number in range(IN_FLIGHT):
-            episode = make_episode(20, id=f"{actor}-{number}", actor=actor)
-            key = Keys("former-name").sequence(actor)
-            left.add(episode.id, key, encode(Sequence(episode)), [Role.LEARNER])
+    leave_sequences(setup, make_episode, "actor-1")
     setup.start_actor()
     setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
-    arrived = {episode.id for episode in setup.sequences}
-    assert len(arrived) == 2 * IN_FLIGHT
-    assert not list(setup.outbox.parent.glob("*/*/*"))
+    assert len({episode.id for episode in setup.sequences}) == IN_FLIGHT
+    assert not list(setup.outbox.glob("*/*"))
+
+
+def test_an_actor_sends_what_actors_left_that_are_gone_for_good(
+    setup: ActorSetup, make_episode: MakeEpisode
+) -> None:
+    leave_sequences(setup, make_episode, "gone-1")
+    run_folder = setup.outbox.parents[1]
+    config = HubConfig(endpoint=setup.endpoint)
+    with open_bus(config, "test", Role.ACTOR, "another-1") as bus:
+        waits = LeftOutboxes(run_folder, bus)
+        waits.look()
+        assert len(waits) == 0, "it may come back"
+        left = LeftOutboxes(run_folder, bus, gone_after_s=0.0)
+        with own_id(run_folder, Role.ACTOR, "gone-1"):
+            left.look()
+            assert len(left) == 0, "it is about to come back"
+        left.look()
+        with own_id(run_folder, Role.ACTOR, "gone-1"):
+            pass  # it can come back even now
+
+        def all_sent() -> bool:
+            left.look()
+            return len(left) == 0 and len(setup.sequences) >= IN_FLIGHT
+
+        eventually(all_sent, "all receipts have come")
+        left.close()
+    assert not list((run_folder / "outbox" / "gone-1").glob("*/*"))
 
 
 def test_a_rollout_stays_until_the_recorder_has_it_too(
