@@ -6,16 +6,18 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from actors.inquiry import Inquiry
+from actors.left_outboxes import LOOK_EVERY_S, OUTBOXES, LeftOutboxes
 from actors.player import LiveStep, play
 from actors.policies.contract import Policy
 from actors.policies.guided import GuidedPolicy
 from actors.policies.planned import make_tutor
+from actors.receipts import Receipts
 from actors.simulator import make_simulator
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
@@ -24,8 +26,9 @@ from learner.network_policy import NetworkPolicy
 from learner.policy_message import policy_of
 from proto.agreement import ANSWERING, Agreement
 from proto.bus import Bus
-from proto.codec import MessageError, encode
+from proto.codec import MessageError, Wire, encode
 from proto.config import Config
+from proto.disk_waits import when_disk_allows
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.keys import Role
@@ -36,7 +39,6 @@ from proto.messages import (
     EpisodeFailed,
     Live,
     PolicyVersion,
-    Receipt,
     Rollout,
     Sequence,
     Trial,
@@ -50,7 +52,6 @@ from proto.pace import Pace
 from proto.periodic import every
 from proto.plain_text import plain
 from proto.seeds import PRACTICE
-from proto.senders import Sender
 from proto.variables import Situation
 
 LOG = logging.getLogger(__name__)
@@ -147,16 +148,25 @@ class Actor:
         self._bus = bus
         self._lifecycle = lifecycle
         self._agreement = Agreement(config, bus)
-        self._joined = threading.Event()  # set when a learner or evaluator has joined or gone
-        self._present: set[Sender] = set()  # learners and evaluators
+        self._joined = threading.Event()  # set when a learner or evaluator has joined
         self._task = make_task(config.task)
         self._tasks = {self._task.name: self._task}
         if (first := config.pretraining_task) is not None:
             self._tasks[first] = make_task(config.task_called(first))
         self._simulator = make_simulator(config.simulator)
-        outbox = config.run_folder / "outbox" / bus.id
-        self._sequences = Outbox(outbox / "sequences", bus.deliver_wire)
-        self._rollouts = Outbox(outbox / "rollouts", bus.deliver_wire)
+        folder = config.run_folder / "outbox" / bus.id
+        self._sequences, self._rollouts = (
+            Outbox(folder / each, self._deliver) for each in OUTBOXES
+        )
+        self._receipts = Receipts(bus)
+        self._left = LeftOutboxes(config.run_folder, bus, self._receipts)
+        keys = bus.keys
+        self._ask_learner = Inquiry[TutoringRequest, TutoringCase | Correction](
+            lambda request: bus.ask(keys.request_tutoring, request, TutoringCase, Correction)
+        )
+        self._ask_evaluator = Inquiry[TrialRequest, Trial](
+            lambda request: bus.ask(keys.request_trial, request, Trial)
+        )
         self._policy: NetworkPolicy | None = None
         self._policy_run = ""
         self._offered: _Offer | None = None
@@ -171,24 +181,30 @@ class Actor:
         """Play until it should stop; the episode that is played then is given up.
 
         Raises:
-            UserError: its configuration does not fit the run, or an episode cannot be written to
-                disk.
+            UserError: its configuration does not fit the run.
+            StorageError: it should stop, and an episode cannot be written to disk.
         """
         keys = self._bus.keys
         for role in ANSWERING:
-            self._bus.watch_presence(role, self._on_presence_of(role))
+            self._bus.watch_presence(role, self._on_presence)
         self._agreement.check()
-        self._bus.subscribe_with_sender(keys.receipt(self._bus.id), self._on_receipt, Receipt)
+        outboxes = (self._sequences, self._rollouts)
+        self._receipts.pass_on(self._bus.id, lambda: outboxes)
         self._bus.subscribe_newest(keys.policy, self._on_policy, PolicyVersion)
         try:
             with (
                 membership(self._bus, self, self._lifecycle),
                 every(OUTBOX_PERIOD_S, self._sequences.send_due),
                 every(OUTBOX_PERIOD_S, self._rollouts.send_due),
+                every(LOOK_EVERY_S, self._left.look),
             ):
+                self._left.look()
                 while not self._lifecycle.stopping:
                     self._play_next()
         finally:
+            self._ask_learner.close()
+            self._ask_evaluator.close()
+            self._left.close()
             self._simulator.close()
 
     def metrics(self) -> ActorMetrics:
@@ -216,7 +232,7 @@ class Actor:
 
     @property
     def _waiting(self) -> int:
-        return len(self._sequences) + len(self._rollouts)
+        return len(self._sequences) + len(self._rollouts) + len(self._left)
 
     def _play_next(self) -> None:
         assignment = None
@@ -224,8 +240,10 @@ class Actor:
             self._take_newest_policy()
             assignment = self._tutoring() or self._trial() or self._practice()
         if assignment is None:
+            self._lifecycle.waits_for(self._missing)
             self._lifecycle.wait(IDLE_S)
             return
+        self._lifecycle.waits_for("")
         try:
             episode = self._play(assignment)
             self._send(episode)
@@ -250,15 +268,34 @@ class Actor:
             return False
         return True
 
-    def _on_presence_of(self, role: Role) -> Callable[[str, bool], None]:
-        def on_change(name: str, alive: bool) -> None:
-            if alive:
-                self._present.add(Sender(role, name))
-                self._joined.set()
-            else:
-                self._present.discard(Sender(role, name))
+    def _on_presence(self, _name: str, alive: bool) -> None:
+        if alive:
+            self._joined.set()
 
-        return on_change
+    @property
+    def _missing(self) -> str:
+        """What it takes to play."""
+        if self._lifecycle.paused:
+            return "the end of the pause"
+        if self._bus.hub_is_away:
+            return "the hub"
+        silent = [
+            str(role)
+            for role, inquiry in (
+                (Role.LEARNER, self._ask_learner),
+                (Role.EVALUATOR, self._ask_evaluator),
+            )
+            if inquiry.unanswered
+        ]
+        if silent:
+            return f"an answer of the {' and the '.join(silent)}"
+        if missing := sorted(self._sequences.missing | self._rollouts.missing):
+            return f"receipts of the {' and the '.join(missing)}"
+        return "something to play" if self._policy else "something to play, or a policy"
+
+    def _deliver(self, key: str, wire: Wire) -> None:
+        """Send what is in the outbox, also if it was kept while the run had another name."""
+        self._bus.deliver_wire(self._bus.keys.renamed(key, self._bus.id), wire)
 
     def _tutoring(self) -> Assignment | None:
         """A tutored case or a correction that the learner asks for; None if there is none."""
@@ -266,10 +303,7 @@ class Actor:
             return None
         version = self._policy.version if self._policy else 0
         request = TutoringRequest(self._bus.id, self._policy_run, version, self._agreement.digest)
-        key = self._bus.keys.request_tutoring
-        answers: list[TutoringCase | Correction]
-        answers = self._bus.ask(key, request, TutoringCase, Correction)
-        for answer in answers:
+        for answer in self._ask_learner.answers(request):
             try:
                 if isinstance(answer, Correction):
                     return self._guidance(answer)
@@ -319,7 +353,7 @@ class Actor:
         request = TrialRequest(
             self._bus.id, self._policy_run, self._policy.version, self._agreement.digest
         )
-        for trial in self._bus.ask(self._bus.keys.request_trial, request, Trial):
+        for trial in self._ask_evaluator.answers(request):
             situation = self._task.sample(trial.seed)
             return Assignment(
                 Kind.TRIAL, self._task, self._policy, situation, trial.seed, self._policy_run
@@ -345,6 +379,7 @@ class Actor:
             if self._lifecycle.stopping:
                 raise _StoppedError
             self._pace.add()
+            self._lifecycle.goes_on()
             if self._config.actor.live and self._bus.watched(live_key):
                 message = live_message(self._bus.id, assignment, live)
                 self._bus.publish(live_key, message, check=False)
@@ -361,10 +396,15 @@ class Actor:
                 config_digest=self._agreement.digest,
                 on_step=on_step,
             )
-        except (ArithmeticError, ValueError, RuntimeError) as error:
+        except (_StoppedError, UserError, OSError, MemoryError):
+            raise  # nothing is wrong with the episode
+        except Exception as error:
+            problem = f"{type(error).__name__}: {error}"
             if self._simulation_is_finite():
+                # The next process starts with a new simulator; the report is on disk before.
+                self._report_failure(assignment, problem)
                 raise
-            raise _SimulationError(f"{type(error).__name__}: {error}") from error
+            raise _SimulationError(problem) from error
         return replace(episode, training=assignment.training)
 
     def _simulation_is_finite(self) -> bool:
@@ -376,7 +416,7 @@ class Actor:
 
         Raises:
             _SimulationError: its values are not those of an episode, such as NaN.
-            UserError: it cannot be written to disk.
+            StorageError: the actor should stop, and it cannot be written to disk.
         """
         learned_from = episode.kind in (Kind.TUTORING, Kind.CORRECTION)
         keys, actor = self._bus.keys, self._bus.id
@@ -388,9 +428,13 @@ class Actor:
         except MessageError as error:
             raise _SimulationError(str(error)) from error
         if learned_from:
-            self._sequences.add(episode.id, keys.sequence(actor), wire)
+            outbox, key, receivers = self._sequences, keys.sequence(actor), [Role.LEARNER]
         else:
-            self._rollouts.add(episode.id, keys.rollout(actor), wire)
+            outbox, key, receivers = self._rollouts, keys.rollout(actor), [Role.EVALUATOR]
+            recorder = self._config.recorder
+            if recorder.required and (recorder.practice or episode.kind is Kind.TRIAL):
+                receivers.append(Role.RECORDER)
+        when_disk_allows(self._lifecycle, lambda: outbox.add(episode.id, key, wire, receivers))
 
     def _report_failure(self, failed: Assignment, problem: str) -> None:
         """Tell the process that asked for the episode; nobody asks for practice."""
@@ -408,19 +452,11 @@ class Actor:
             policy_version=failed.policy.version,
             problem=plain(problem)[:1000],
         )
-        outbox = self._rollouts if failed.kind is Kind.TRIAL else self._sequences
-        outbox.add(report.id, self._bus.keys.failure(self._bus.id), encode(report))
-
-    def _on_receipt(self, receipt: Receipt, sender: Sender) -> None:
-        """Believe a receipt for what was sent to this sender, if it is there."""
-        if sender not in self._present:
-            self._bus.refuse(str(sender), "it gives receipts, but is not present in this run")
-            return
-        outbox = self._sequences if sender.role is Role.LEARNER else self._rollouts
-        if receipt.refusal:
-            outbox.refused(receipt.episode, receipt.refusal)
-        else:
-            outbox.received(receipt.episode)
+        outbox, receiver = self._sequences, Role.LEARNER
+        if failed.kind is Kind.TRIAL:
+            outbox, receiver = self._rollouts, Role.EVALUATOR
+        key, wire = self._bus.keys.failure(self._bus.id), encode(report)
+        when_disk_allows(self._lifecycle, lambda: outbox.add(report.id, key, wire, [receiver]))
 
     def _on_policy(self, message: PolicyVersion) -> None:
         """Keep the newest policy of this run until the next episode begins."""

@@ -6,45 +6,37 @@ import argparse
 import os
 import sys
 import time
-from collections import defaultdict, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Final
 
 from rich.console import Console
 
-from deploy.supervision import BAD_INPUT, ProcessState, Program, Supervisor
-from proto.bus import Bus, open_bus
+from deploy.supervision import (
+    BAD_INPUT,
+    ProcessFailedError,
+    Program,
+    Supervisor,
+    SupervisorEndedError,
+    Watchdog,
+)
+from proto.bus import Bus, NoHubError, open_bus
 from proto.config import Config, load_config
 from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
+from proto.run_locks import owned_run
 from services.arguments.common import config_argument, integer
 from services.board import Board, RunView
 from services.machine.ports import port_trouble
-from services.terminal.console import make_console
 from services.terminal.display import display
 from services.terminal.run_words import success_words
 
 DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
 VMDNN: Final = str(Path(sys.executable).with_name("vmdnn"))
-
-HUB_WITHIN_S: Final = 30.0
-TOO_MANY_CRASHES: Final = 5
-TOO_SHORT_S: Final = 60.0
-"""A process that crashes TOO_MANY_CRASHES times within this time ends the run."""
-
-
-class ProcessFailedError(Exception):
-    """A process has ended for good or crashes repeatedly; the message has the end of its log."""
-
-    def __init__(self, process: ProcessState, problem: str) -> None:
-        lines = process.log.read_text(errors="replace").splitlines() if process.log.exists() else []
-        last = "\n".join(f"    {line}" for line in lines[-12:])
-        super().__init__(f"{process.name} {problem}; the end of {process.log}:\n{last}")
-        self.exit_status = BAD_INPUT if process.exit_status == BAD_INPUT else 1
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -63,16 +55,28 @@ def main(argv: Sequence[str] | None = None) -> int:
             overrides.append(f"simulator.backend={arguments.backend}")
         config = load_config(arguments.config, overrides)
         actors = default_actors() if arguments.actors is None else arguments.actors
+        check_can_be_done(config)
         if trouble := port_trouble(config.hub.endpoint):
             raise UserError(trouble)
-        run(config, actors, make_console())
-    except UserError as error:
+        run(config, actors, RunConsole())
+    except (UserError, ProcessFailedError) as error:
         print(f"run_local: {error}", file=sys.stderr)
         return BAD_INPUT
-    except ProcessFailedError as error:
-        print(f"run_local: {error}", file=sys.stderr)
-        return error.exit_status
+    except SupervisorEndedError as error:
+        print(f"run_local: {error}; the same command continues the run", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:  # before signals were handled: nothing was started
+        return 130
     return 0
+
+
+class RunConsole(Console):
+    """A console whose reader may end: the run goes on."""
+
+    def on_broken_pipe(self) -> None:
+        """Print nothing more."""
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def default_actors() -> int:
@@ -89,9 +93,15 @@ def run(config: Config, actors: int, console: Console) -> None:
         console: shows the state of the run.
 
     Raises:
-        UserError: the run's folder cannot be used.
-        ProcessFailedError: a process has ended for good or crashes repeatedly.
+        UserError: the run's folder cannot be used, or the run is being played already.
+        ProcessFailedError: a process can never work.
+        SupervisorEndedError: supervisord was killed.
     """
+    with owned_run(config.run_folder):  # nothing of the run is touched before
+        _run(config, actors, console)
+
+
+def _run(config: Config, actors: int, console: Console) -> None:
     started_s = time.monotonic()
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
@@ -104,16 +114,23 @@ def run(config: Config, actors: int, console: Console) -> None:
         f"{'continuing' if exists else 'starting'} run {config.run.name} with {actors} "
         f"{'actor' if actors == 1 else 'actors'} in {config.run_folder}",
         highlight=False,
+        soft_wrap=True,
     )
     with Supervisor(programs(config, file, actors), logs) as supervisor:
+        watchdog = Watchdog(
+            supervisor, lambda text: console.print(text, highlight=False, soft_wrap=True)
+        )
         supervisor.start("hub")
-        with _connect(config, supervisor, lifecycle) as bus:
-            for program in supervisor.programs[1:]:
-                supervisor.start(program.name)
-            view = _follow(Board(bus), supervisor, lifecycle, console)
+        view = None
+        with _connect(config, watchdog, lifecycle) or nullcontext() as bus:
+            if bus is not None:
+                for program in supervisor.programs[1:]:
+                    supervisor.start(program.name)
+                view = _follow(Board(bus), watchdog, lifecycle, console)
         console.print("stopping", highlight=False)
-    text = summary(view, config, time.monotonic() - started_s)
-    console.print(text, highlight=False, soft_wrap=True)
+    if view is not None:
+        text = summary(view, config, time.monotonic() - started_s)
+        console.print(text, highlight=False, soft_wrap=True)
 
 
 def programs(config: Config, file: Path, actors: int) -> list[Program]:
@@ -147,35 +164,19 @@ def is_done(view: RunView) -> bool:
     return all(m.done for m in learners) and all(m.done for m in evaluators)
 
 
-class Crashes:
-    """Detects crashes of processes, which supervisord starts again."""
+def check_can_be_done(config: Config) -> None:
+    """Check that the condition `done` of a configuration can be reached.
 
-    def __init__(self) -> None:
-        """Start with no crashes."""
-        self._started_s: dict[str, int] = {}
-        self._crashes_s: defaultdict[str, deque[int]] = defaultdict(
-            lambda: deque(maxlen=TOO_MANY_CRASHES)
+    Raises:
+        UserError: it asks for more policy versions than there will be.
+    """
+    wanted, possible = config.done.policy_versions, config.policy_versions
+    if wanted is not None and wanted > possible:
+        raise UserError(
+            f"done.policy_versions: {wanted} can never be reached, because this configuration "
+            f"gives {possible} policy versions (learner.epochs, learner.publish_every_epochs, "
+            "learner.corrections.rounds): set it to at most this number"
         )
-
-    def update(self, processes: Iterable[ProcessState]) -> list[ProcessState]:
-        """Return the processes that were started again since the last call.
-
-        Raises:
-            ProcessFailedError: a process has ended for good or crashes repeatedly.
-        """
-        restarted = []
-        for process in processes:
-            if process.gave_up:
-                raise ProcessFailedError(process, "has ended and is not started again")
-            before_s = self._started_s.get(process.name, 0)
-            self._started_s[process.name] = process.started_s
-            if before_s and process.started_s != before_s:
-                restarted.append(process)
-                crashes_s = self._crashes_s[process.name]
-                crashes_s.append(process.started_s)
-                if len(crashes_s) == TOO_MANY_CRASHES and _span(crashes_s) < TOO_SHORT_S:
-                    raise ProcessFailedError(process, "crashes repeatedly")
-        return restarted
 
 
 def summary(view: RunView, config: Config, wall_s: float) -> str:
@@ -191,32 +192,27 @@ def summary(view: RunView, config: Config, wall_s: float) -> str:
     return "\n".join(lines)
 
 
-def _follow(
-    board: Board, supervisor: Supervisor, lifecycle: Lifecycle, console: Console
-) -> RunView:
+def _follow(board: Board, watchdog: Watchdog, lifecycle: Lifecycle, console: Console) -> RunView:
     """Show the state of the run until it is done or is to stop; return the last state."""
-    crashes = Crashes()
     with display(console) as show:
         while True:
             view = board.view()
             show(view)
-            for process in crashes.update(supervisor.processes()):
-                console.print(f"{process.name} crashed and was started again; see {process.log}")
+            watchdog.look()
             if lifecycle.stopping or is_done(view):
                 return view
             lifecycle.wait(METRICS_PERIOD_S)
 
 
-def _connect(config: Config, supervisor: Supervisor, lifecycle: Lifecycle) -> Bus:
-    deadline = time.monotonic() + HUB_WITHIN_S
-    crashes = Crashes()
-    while True:
+def _connect(config: Config, watchdog: Watchdog, lifecycle: Lifecycle) -> Bus | None:
+    """Connect to the hub, which has been started; None if this process was asked to stop."""
+    while not lifecycle.stopping:
+        watchdog.look()
         try:
             return open_bus(config.hub, config.run.name, Role.WATCH, f"run-local-{os.getpid()}")
-        except UserError:
-            crashes.update(supervisor.processes())
-            if lifecycle.stopping or time.monotonic() > deadline:
-                raise
+        except NoHubError:
+            lifecycle.wait(METRICS_PERIOD_S)
+    return None
 
 
 def _newest_counted(scores: Sequence[PolicyScore], config: Config) -> PolicyScore | None:
@@ -240,10 +236,6 @@ def _score_lines(score: PolicyScore | None, config: Config) -> list[str]:
             )
         ),
     ]
-
-
-def _span(times_s: Sequence[int]) -> int:
-    return times_s[-1] - times_s[0]
 
 
 def _parser() -> argparse.ArgumentParser:

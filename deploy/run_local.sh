@@ -7,8 +7,8 @@ usage() {
 usage: deploy/run_local.sh [--config FILE] [--actors N] [--backend NAME] [--set KEY=VALUE ...]
 
 Sets up this machine if necessary (.venv with the locked packages and, as root or with sudo, a
-graphics driver), then starts hub, learner, evaluator, recorder and actors. Processes that crash
-are started again. Shows their state until the config's `done` is reached or Ctrl-C is pressed, then
+graphics driver), then starts hub, learner, evaluator, recorder and actors. Processes that end or
+are stuck are started again. Shows their state until the config's `done` is reached or Ctrl-C is pressed, then
 stops all processes and prints a summary. The same command continues a run that was stopped.
 
   --config FILE     a file, or the name of a configuration in deploy/config (default:
@@ -18,7 +18,7 @@ stops all processes and prints a summary. The same command continues a run that 
   --set KEY=VALUE   override a value of the config, such as learner.rate=1e-3; may be repeated
 
 Files are written to RUN.FOLDER/RUN.NAME, by default runs/experiment1 in the current folder. Exit
-status: 0 done or stopped by you, 1 a process crashes repeatedly, 2 bad input.
+status: 0 done or stopped by you, 1 the supervisor was killed, 2 bad input.
 END
 }
 

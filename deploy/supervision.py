@@ -1,29 +1,46 @@
-"""Runs the processes of a run under supervisord.
+"""Runs the processes of a run under supervisord, and starts those again that end or are stuck.
 
-Processes that crash are started again. All processes end when the run ends.
+supervisord starts and stops processes and keeps their logs. Whether one is started again, and when,
+decides `Watchdog`. All processes end when the run ends.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shlex
+import signal
+import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
-from xmlrpc.client import ServerProxy
+from xmlrpc.client import Fault, ServerProxy
 
 from supervisor.xmlrpc import SupervisorTransport
 
 from proto.errors import UserError
 from proto.storage import written_whole
+from services.arguments.process import HEARTBEAT_FILE
 
 START_WITHIN_S: Final = 20.0
+ANSWER_WITHIN_S: Final = 10.0
+"""Time in which supervisord must answer a request."""
+STUCK_AFTER_S: Final = 60.0
+"""A process without a heartbeat for this time is killed."""
+FIRST_BEAT_WITHIN_S: Final = 300.0
+"""A process that starts on a busy machine needs time until its first heartbeat."""
+WELL_AFTER_S: Final = 60.0
+"""A process that has run for this time is started again at once when it ends."""
+LONGEST_DELAY_S: Final = 30.0
+_LATE_S: Final = 30.0
+_SOCKET_PATH_BYTES: Final = 100
 BAD_INPUT: Final = 2
 """Exit status for bad input; a process that ends with it is not started again."""
 
@@ -58,24 +75,38 @@ class ProcessState:
 
     Attributes:
         name: name of the process, see Program.
+        group: name of its program.
         state: the state in supervisord's terms, such as RUNNING, EXITED or FATAL.
         pid: process id, 0 if it does not run.
         started_s: time of its last start (Unix time), 0 if it was not started.
-        exit_status: exit status of the last process of this name that ended.
+        exit_status: exit status of the last process of this name that ended; -1 after a signal.
         log: file with its output.
+        heartbeat_ns: when it touched its heartbeat file last (Unix time); None if that cannot be
+            known.
     """
 
     name: str
+    group: str
     state: str
     pid: int
     started_s: int
     exit_status: int
     log: Path
+    heartbeat_ns: int | None = None
 
     @property
-    def gave_up(self) -> bool:
-        """Whether it has ended and is not started again."""
-        return self.state == "FATAL" or (self.state == "EXITED" and self.exit_status == BAD_INPUT)
+    def ended(self) -> bool:
+        """Whether it was started and does not run any more."""
+        return bool(self.started_s) and self.state in {"EXITED", "FATAL", "STOPPED"}
+
+    @property
+    def cannot_work(self) -> bool:
+        """Whether it has ended because of bad input, so that another start would not help."""
+        return self.ended and self.exit_status == BAD_INPUT
+
+
+class SupervisorEndedError(Exception):
+    """supervisord has ended although it was not told to."""
 
 
 class Supervisor:
@@ -95,13 +126,12 @@ class Supervisor:
         self._process: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> Self:
-        # The path of a socket has at most 107 characters; that of the run's folder can be longer.
-        self._socket_folder = tempfile.TemporaryDirectory(prefix="vmdnn-")
-        socket = Path(self._socket_folder.name) / "socket"
+        self._socket_folder = _short_folder()
+        self._socket = Path(self._socket_folder.name) / "socket"
+        self._heartbeats = self._socket.parent
         config = self._folder / "supervisord.conf"
         with written_whole(config) as stream:
-            stream.write(supervisord_config(self.programs, self._folder, socket).encode())
-        self._socket = socket
+            stream.write(supervisord_config(self.programs, self._folder, self._socket).encode())
         self._process = subprocess.Popen(
             (*_DIES_WITH_PARENT, sys.executable, "-m", "supervisor.supervisord", "-c", config),
             stdin=subprocess.DEVNULL,
@@ -125,19 +155,33 @@ class Supervisor:
         self.stop()
 
     def start(self, program: str) -> None:
-        """Start the processes of a program; supervisord starts them again when they crash."""
+        """Start the processes of a program."""
         self._ask("startProcessGroup", program, False)
 
+    def start_again(self, process: ProcessState) -> None:
+        """Start a process that has ended; nothing happens if it runs."""
+        self._ask_for(process, "startProcess", False)
+
+    def kill(self, process: ProcessState) -> None:
+        """Send SIGKILL to a process; nothing happens if it has ended."""
+        self._ask_for(process, "signalProcess", "KILL")
+
     def processes(self) -> list[ProcessState]:
-        """Return the state of all processes."""
+        """Return the state of all processes.
+
+        Raises:
+            SupervisorEndedError: supervisord has ended.
+        """
         return [
             ProcessState(
                 name=info["name"],
+                group=info["group"],
                 state=info["statename"],
                 pid=info["pid"],
                 started_s=info["start"],
                 exit_status=info["exitstatus"],
                 log=Path(info["stdout_logfile"]),
+                heartbeat_ns=self._heartbeat_ns(info["name"]),
             )
             for info in self._ask("getAllProcessInfo")
         ]
@@ -152,21 +196,74 @@ class Supervisor:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._end_orphans()
         self._process = None
         self._socket_folder.cleanup()
+
+    def heartbeat_file(self, process: str) -> Path:
+        """The file that a process touches as long as it goes on."""
+        return self._heartbeats / process
+
+    def _heartbeat_ns(self, process: str) -> int | None:
+        file = self.heartbeat_file(process)
+        try:
+            if not file.exists():
+                file.touch()
+            return file.stat().st_mtime_ns
+        except OSError:  # such as a full disk
+            return None
+
+    def _end_orphans(self) -> None:
+        """Wait for processes that supervisord left behind, and kill those that do not end.
+
+        They got SIGTERM when supervisord died.
+        """
+        deadline = time.monotonic() + max((p.stop_within_s for p in self.programs), default=0)
+        while orphans := self._children():
+            if time.monotonic() > deadline:
+                for pid in orphans:
+                    with contextlib.suppress(OSError):
+                        os.kill(pid, signal.SIGKILL)
+                return
+            time.sleep(0.1)
+
+    def _children(self) -> list[int]:
+        """Living processes that this supervisor started; the path in their environment tells."""
+        mark, found = str(self._heartbeats).encode(), []
+        for environment in Path("/proc").glob("[0-9]*/environ"):
+            with contextlib.suppress(OSError):  # it has just ended, or is somebody else's
+                if mark in environment.read_bytes():
+                    found.append(int(environment.parent.name))
+        return found
 
     def _ask(self, method: str, *arguments: object) -> Any:
         # A transport cannot be used again after a failure, so each request makes a new one.
         transport = SupervisorTransport(serverurl=f"unix://{self._socket}")
-        with ServerProxy("http://supervisord", transport) as supervisord:
-            return getattr(supervisord.supervisor, method)(*arguments)
+        default_s = socket.getdefaulttimeout()
+        socket.setdefaulttimeout(ANSWER_WITHIN_S)  # the transport has no option for it
+        try:
+            with ServerProxy("http://supervisord", transport) as supervisord:
+                return getattr(supervisord.supervisor, method)(*arguments)
+        except (OSError, HTTPException) as error:
+            if self._process is None or self._process.poll() is None:
+                raise
+            raise SupervisorEndedError(
+                "supervisord was killed, and its processes were stopped with it"
+            ) from error
+        finally:
+            socket.setdefaulttimeout(default_s)
+
+    def _ask_for(self, process: ProcessState, method: str, *arguments: object) -> None:
+        # The state may have changed since it was looked at: then supervisord answers with a fault.
+        with contextlib.suppress(Fault):
+            self._ask(method, f"{process.group}:{process.name}", *arguments)
 
     def _wait_until_it_replies(self, config: Path) -> None:
         deadline = time.monotonic() + START_WITHIN_S
         while True:
             try:
                 self.processes()
-            except (OSError, HTTPException) as error:
+            except (OSError, HTTPException, SupervisorEndedError) as error:
                 ended = self._process is None or self._process.poll() is not None
                 if ended or time.monotonic() > deadline:
                     raise RuntimeError(
@@ -175,6 +272,124 @@ class Supervisor:
                 time.sleep(0.1)
             else:
                 return
+
+
+@dataclass
+class _Watched:
+    """What the watchdog remembers of a process.
+
+    Attributes:
+        heartbeat_ns: its last heartbeat.
+        beat_at_s: when the watchdog saw it (monotonic clock).
+        beats: whether it has had a heartbeat since its start.
+        start_at_s: when it will be started again; None if it runs.
+        delay_s: how long it waited for its last start.
+        up_since_s: when the watchdog saw it run for the first time since its start.
+    """
+
+    heartbeat_ns: int | None
+    beat_at_s: float
+    beats: bool = False
+    start_at_s: float | None = None
+    delay_s: float = 0.0
+    up_since_s: float = 0.0
+
+
+class Watchdog:
+    """Starts processes again that have ended, and kills those that have no heartbeat.
+
+    A process is started again at once, and later each time that it ends soon after its start.
+    """
+
+    def __init__(
+        self,
+        supervisor: Supervisor,
+        tell: Callable[[str], None],
+        *,
+        stuck_after_s: float = STUCK_AFTER_S,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Watch the processes of a supervisor.
+
+        Args:
+            supervisor: its programs.
+            tell: called with a sentence about each process that ended or is stuck.
+            stuck_after_s: a process without a heartbeat for this time is killed (s).
+            clock: gives the time in seconds.
+        """
+        self._supervisor = supervisor
+        self._tell = tell
+        self._stuck_after_s = stuck_after_s
+        self._clock = clock
+        self._watched: dict[str, _Watched] = {}
+        self._looked_at_s = self._answered_at_s = clock()
+
+    def look(self) -> None:
+        """Look after all processes; called about once a second.
+
+        Raises:
+            ProcessFailedError: a process ended because of bad input.
+            SupervisorEndedError: supervisord has ended.
+        """
+        now_s = self._clock()
+        # Someone who was frozen cannot know how long the others were silent.
+        late_s = now_s - self._looked_at_s
+        if late_s > _LATE_S:
+            self._answered_at_s += late_s
+            for watched in self._watched.values():
+                watched.beat_at_s += late_s
+        self._looked_at_s = now_s
+        try:
+            for process in self._supervisor.processes():
+                self._look_at(process, now_s)
+        except (OSError, HTTPException) as error:  # it may answer again
+            if now_s - self._answered_at_s > self._stuck_after_s:
+                raise SupervisorEndedError(f"supervisord does not answer ({error})") from error
+        else:
+            self._answered_at_s = now_s
+
+    def _look_at(self, process: ProcessState, now_s: float) -> None:
+        if process.cannot_work:
+            raise ProcessFailedError(process, "cannot work and is not started again")
+        if not process.started_s:
+            return
+        beat = process.heartbeat_ns
+        watched = self._watched.setdefault(process.name, _Watched(beat, now_s, up_since_s=now_s))
+        limit_s = self._stuck_after_s if watched.beats else FIRST_BEAT_WITHIN_S
+        if process.ended:
+            self._start_again(process, watched, now_s)
+        elif beat != watched.heartbeat_ns or beat is None:
+            watched.heartbeat_ns, watched.beat_at_s, watched.beats = beat, now_s, True
+        elif now_s - watched.beat_at_s > limit_s:
+            self._tell(
+                f"{process.name} is stuck: no sign of life for {limit_s:.0f} s. It is killed and "
+                f"started again; see {process.log}"
+            )
+            self._supervisor.kill(process)
+            watched.beat_at_s = now_s
+
+    def _start_again(self, process: ProcessState, watched: _Watched, now_s: float) -> None:
+        if watched.start_at_s is None:
+            well = now_s - watched.up_since_s >= WELL_AFTER_S
+            watched.delay_s = 0.0 if well else min(2 * watched.delay_s + 0.5, LONGEST_DELAY_S)
+            watched.start_at_s = now_s + watched.delay_s
+            when = f"in {watched.delay_s:.0f} s" if watched.delay_s >= 1 else "now"
+            how = "was killed" if process.exit_status < 0 else f"ended ({process.exit_status})"
+            self._tell(f"{process.name} {how} and is started again {when}; see {process.log}")
+        if now_s >= watched.start_at_s:
+            watched.start_at_s = None
+            watched.beats = False
+            watched.beat_at_s = watched.up_since_s = now_s
+            self._supervisor.start_again(process)
+
+
+class ProcessFailedError(Exception):
+    """A process can never work; the message has the end of its log."""
+
+    def __init__(self, process: ProcessState, problem: str) -> None:
+        lines = process.log.read_text(errors="replace").splitlines() if process.log.exists() else []
+        last = "\n".join(f"    {line}" for line in lines[-12:])
+        super().__init__(f"{process.name} {problem}; the end of {process.log}:\n{last}")
 
 
 def supervisord_config(programs: Sequence[Program], folder: Path, socket: Path) -> str:
@@ -203,11 +418,30 @@ chmod=0700
 [rpcinterface:supervisor]
 supervisor.rpcinterface_factory=supervisor.rpcinterface:make_main_rpcinterface
 """
-    sections = [_section(rank, program, folder) for rank, program in enumerate(programs, start=1)]
+    sections = [
+        _section(rank, program, folder, socket.parent)
+        for rank, program in enumerate(programs, start=1)
+    ]
     return "\n".join([head, *sections])
 
 
-def _section(rank: int, program: Program, folder: Path) -> str:
+def _short_folder() -> tempfile.TemporaryDirectory[str]:
+    """Make a temporary folder for a socket, whose path has at most 107 bytes."""
+    for place in (None, "/tmp", "/var/tmp", "/dev/shm"):
+        try:
+            folder = tempfile.TemporaryDirectory(prefix="vmdnn-", dir=place)
+        except OSError:
+            continue
+        if len(os.fsencode(folder.name)) <= _SOCKET_PATH_BYTES:
+            return folder
+        folder.cleanup()
+    raise UserError(
+        "no folder for temporary files can be used: set TMPDIR to a folder that can be written, "
+        f"with a path of at most {_SOCKET_PATH_BYTES - 20} characters"
+    )
+
+
+def _section(rank: int, program: Program, folder: Path, heartbeats: Path) -> str:
     name = "%(program_name)s" if program.processes == 1 else "%(program_name)s-%(process_num)d"
     return f"""\
 [program:{program.name}]
@@ -216,10 +450,9 @@ process_name={name}
 numprocs={program.processes}
 numprocs_start=1
 priority={rank}
-environment=OMP_NUM_THREADS="{program.threads}"
+environment=OMP_NUM_THREADS="{program.threads}",{HEARTBEAT_FILE}="{_plain(heartbeats)}/{name}"
 autostart=false
-autorestart=unexpected
-exitcodes=0,{BAD_INPUT}
+autorestart=false
 startsecs=0
 stopsignal=TERM
 stopwaitsecs={program.stop_within_s}

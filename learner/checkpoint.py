@@ -329,6 +329,11 @@ def training_file(run_folder: Path) -> Path:
     return run_folder / "checkpoints" / "training.safetensors"
 
 
+def previous_training_file(run_folder: Path) -> Path:
+    """Where a run keeps the training checkpoint before the newest one."""
+    return run_folder / "checkpoints" / "training-before.safetensors"
+
+
 def pretraining_file(run_folder: Path) -> Path:
     """Where a run keeps the training as it was when pre-training was over, with its classifier."""
     return run_folder / "checkpoints" / "pretraining.safetensors"

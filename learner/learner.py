@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import logging
+import re
 import secrets
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
-from learner.checkpoint import policy_file, pretraining_file, training_file
+from learner.checkpoint import (
+    CheckpointMetadata,
+    checkpoint_from_bytes,
+    policy_file,
+    pretraining_file,
+    previous_training_file,
+    training_file,
+)
 from learner.policy_message import policy_message
 from learner.training.training_run import (
     open_training,
     policy_is_due,
     pretraining_is_over,
+    save_training,
     write_policy,
 )
 from learner.training.vmdnn_recipe import VMDNNRecipe
@@ -28,7 +38,9 @@ from proto.acceptance import misfit, same_situation
 from proto.agreement import OTHER_SETTINGS, Agreement
 from proto.bus import Bus, Inbox
 from proto.config import Config
+from proto.disk_waits import when_disk_allows
 from proto.episode import Episode, Kind
+from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import alone_in_run, membership
@@ -48,7 +60,7 @@ from proto.plain_text import plain
 from proto.recordings.episodes import EpisodeSummary
 from proto.seeds import SEEDS_PER_CASE
 from proto.senders import Sender
-from proto.storage import written_whole
+from proto.storage import change_suffix, delete_file, parts_in, rename, written_whole
 from proto.variables import Situation
 
 LOG = logging.getLogger(__name__)
@@ -102,6 +114,7 @@ class Learner:
         self._bus = bus
         self._lifecycle = lifecycle
         self._folder = config.run_folder
+        _delete_unfinished_files(self._folder)
         tutored_cases = {name: len(task.tutored()) for name, task in tasks.items()}
         self._curriculum = Curriculum(config, tutored_cases)
         self._tasks = tasks
@@ -123,6 +136,9 @@ class Learner:
         )
         self._training = threading.Lock()  # held while the trainer changes or is written to disk
         self._run_id = _run_id(self._folder)
+        self._damaged = 0
+        self._published: tuple[int, CheckpointMetadata, bytes] | None = None
+        self._find_newest_policy()
         self._round = self._make_round(resumed=True)
         self._given_up = 0
         for shown in found:
@@ -139,7 +155,7 @@ class Learner:
         alone_in_run(self._bus, self._lifecycle)
         self._agreement.check()
         self._agreement.answer()
-        self._config.save(self._folder / "config.yaml")
+        self._write(lambda: self._config.save(self._folder / "config.yaml"))
         self._publish()
         keys = self._bus.keys
         sequences = self._bus.inbox(keys.sequence(), Sequence, capacity=WAITING)
@@ -148,6 +164,7 @@ class Learner:
         with membership(self._bus, self, self._lifecycle):
             while not self._lifecycle.stopping:
                 may_train = self._may_train
+                self._lifecycle.waits_for("" if may_train else self._missing)
                 self._receive(sequences, wait_s=0.0 if may_train else IDLE_S)
                 self._receive_failures(failures)
                 if may_train:
@@ -169,20 +186,41 @@ class Learner:
             round=self._trainer.round,
             corrections=awaited.kept if awaited else 0,
             corrections_total=awaited.most if awaited else 0,
-            damaged=sum(len(store.damaged) for store in self._stores.values()),
+            damaged=self._damaged + sum(len(store.damaged) for store in self._stores.values()),
             given_up=self._given_up,
             epochs_per_s=self._pace.per_second(),
-            policy_version=self._trainer.version,
+            policy_version=self._newest_version,
             paused=self._lifecycle.paused,
-            done=done.ever and self._trainer.version >= (done.policy_versions or 0),
+            done=done.ever and self._newest_version >= (done.policy_versions or 0),
         )
 
     def checkpoint(self) -> str:
         """Write the training to disk, after the epoch that is going on."""
-        path = training_file(self._folder)
         with self._training:
-            self._trainer.save(path)
-            return f"saved {self._trainer.stage} epoch {self._trainer.epochs_done} to {path}"
+            self._write(lambda: save_training(self._trainer, self._folder))
+            place = training_file(self._folder)
+            return f"saved {self._trainer.stage} epoch {self._trainer.epochs_done} to {place}"
+
+    def _write(self, write: Callable[[], None]) -> None:
+        """Write to disk; wait while the disk does not allow it."""
+        when_disk_allows(self._lifecycle, write)
+
+    @property
+    def _missing(self) -> str:
+        """What the learner waits for while it does not train."""
+        if self._lifecycle.paused:
+            return "the end of the pause"
+        if self._trainer.finished:
+            return ""
+        if (awaited := self._round) is not None:
+            wanted = f"corrections ({awaited.kept} of {awaited.most})"
+        else:
+            wanted = f"sequences ({self._sequences} so far)"
+        return f"the hub, then {wanted}" if self._bus.hub_is_away else wanted
+
+    @property
+    def _newest_version(self) -> int:
+        return self._published[0] if self._published else 0
 
     @property
     def _sequences(self) -> int:
@@ -254,11 +292,15 @@ class Learner:
         while inbox.handle(self._on_failure):
             pass
 
+    def _answer(self, actor: str, receipt: Receipt) -> None:
+        self._bus.deliver(self._bus.keys.receipt(Role.LEARNER, actor), receipt)
+
     def _on_sequence(self, sequence: Sequence) -> None:
         episode = sequence.episode
         refusal = self._refusal(episode)
         if not refusal and self._wants(episode):
-            if self._stores[episode.task].add(episode):
+            add = partial(self._stores[episode.task].add, episode)
+            if when_disk_allows(self._lifecycle, add):
                 self._note(episode)
                 LOG.info("stored a %s sequence, %d in all", episode.kind, self._sequences)
             else:
@@ -266,7 +308,7 @@ class Learner:
         if refusal:
             self._bus.refuse(f"actor/{episode.actor}", refusal)
         # A second demonstration of a case is not stored, but gets its receipt as well.
-        self._bus.deliver(self._bus.keys.receipt(episode.actor), Receipt(episode.id, refusal))
+        self._answer(episode.actor, Receipt(episode.id, refusal))
 
     def _on_failure(self, report: EpisodeFailed) -> None:
         if report.kind not in _LEARNED_FROM:  # the evaluator answers it
@@ -278,7 +320,7 @@ class Learner:
                 "the %s of %s with the seed %d is given up, its simulation failed %d times: %s",
                 *(report.kind, report.task, report.seed, TRIES, plain(report.problem)),
             )
-        self._bus.deliver(self._bus.keys.receipt(report.actor), Receipt(report.id))
+        self._answer(report.actor, Receipt(report.id))
 
     def _refusal(self, episode: Episode) -> str:
         """Why this learner will never store a sequence; empty if it might."""
@@ -344,7 +386,7 @@ class Learner:
         """The round of corrections that the next epoch has to wait for; None if there is none."""
         if not self._trainer.round_begins:
             return None
-        newest = self._run_id, self._trainer.version
+        newest = self._run_id, self._newest_version
         return Round(self._config, self._trainer.round, newest, self._situations, resumed=resumed)
 
     def _end_round(self) -> None:
@@ -364,26 +406,59 @@ class Learner:
             self._trainer.epoch()
             over = pretraining_is_over(self._trainer)
             if over:
-                self._trainer.save(pretraining_file(self._folder))
+                self._write(lambda: self._trainer.save(pretraining_file(self._folder)))
         self._pace.add()
         if policy_is_due(self._trainer):
             with self._training:
-                write_policy(self._trainer, self._folder)
+                self._write(lambda: write_policy(self._trainer, self._folder))
             # the training is on disk before its policy is published
             LOG.info(self.checkpoint())
+            self._find_newest_policy()
             self._round = self._make_round()
             self._publish()
         elif over or self._trainer.epochs_done % self._config.learner.checkpoint_every_epochs == 0:
             LOG.info(self.checkpoint())
 
+    def _find_newest_policy(self) -> None:
+        """Read the newest policy of this training that can be read; set damaged ones aside."""
+        folder = policy_file(self._folder, 0).parent
+        if not training_file(self._folder).exists():  # an older checkpoint had to be used
+            versions = [int(p.stem) for p in folder.glob("*") if re.fullmatch("[0-9]{6}", p.stem)]
+            self._trainer.version = max([self._trainer.version, *versions])
+        for version in range(self._trainer.version, 0, -1):
+            path = policy_file(self._folder, version)
+            try:
+                content = path.read_bytes()
+                metadata = checkpoint_from_bytes(content, f"policy {path}").metadata
+            except OSError:  # it is gone, or was set aside
+                continue
+            except UserError as error:
+                self._damaged += 1
+                aside = change_suffix(path, ".damaged")
+                LOG.warning("%s; it is kept as %s, and the one before is used", error, aside)
+                continue
+            self._published = metadata.version, metadata, content
+            break
+        if (held := self._newest_version) < self._trainer.version:
+            LOG.warning("policy %d is missing; policy %d is used", self._trainer.version, held)
+
     def _publish(self) -> None:
         """Publish the newest policy version, if there is any."""
-        version = self._trainer.version
-        if version == 0:
+        if self._published is None:
             return
-        policy = policy_message(policy_file(self._folder, version), self._run_id)
-        self._bus.publish_newest(self._bus.keys.policy, policy)
-        LOG.info("policy %d is published (epoch %d)", version, policy.epoch)
+        version, metadata, content = self._published
+        self._bus.publish_newest(
+            self._bus.keys.policy, policy_message(self._run_id, metadata, content)
+        )
+        LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
+
+
+def _delete_unfinished_files(folder: Path) -> None:
+    """Delete what killed learners left half written; no other process writes to these folders."""
+    own = (folder / name for name in ("tutoring", "pretraining", "checkpoints", "policies"))
+    for place in (folder, *own):
+        for unfinished in parts_in(place):
+            delete_file(unfinished)
 
 
 def _stores(config: Config) -> Mapping[str, TutoringStore]:
@@ -391,14 +466,27 @@ def _stores(config: Config) -> Mapping[str, TutoringStore]:
     folders = {config.task.name: "tutoring"}
     if config.pretraining_task is not None:
         folders[config.pretraining_task] = "pretraining"
-    return {task: TutoringStore(config.run_folder / name) for task, name in folders.items()}
+    return {
+        task: TutoringStore(config.run_folder / name, sets_aside=True)
+        for task, name in folders.items()
+    }
 
 
 def _run_id(folder: Path) -> str:
-    """Id of the training in a run's folder; a training that starts anew gets a new one."""
-    path = training_file(folder).with_name("run_id")
-    if training_file(folder).exists() and path.exists():
-        return path.read_text()
+    """Id of the training in a run's folder; a training that starts anew gets a new one.
+
+    The policies of the former training are moved to another folder.
+    """
+    path, policies = training_file(folder).with_name("run_id"), policy_file(folder, 0).parent
+    before = path.read_text().strip() if path.exists() else ""
+    if training_file(folder).exists() or previous_training_file(folder).exists():
+        if re.fullmatch("[0-9a-f]{1,64}", before):
+            return before
+        LOG.warning("%s does not hold the id of the training; it gets a new one", path)
+    elif any(policies.glob("*")):
+        moved = policies.with_name(f"policies-{secrets.token_hex(4)}")
+        rename(policies, moved)
+        LOG.warning("the training starts anew; the policies of the former one are in %s", moved)
     run_id = secrets.token_hex(8)
     with written_whole(path) as stream:
         stream.write(run_id.encode())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from learner.checkpoint import (
     Checkpoint,
     CheckpointMetadata,
@@ -18,21 +16,14 @@ from proto.plain_text import plain
 _ORIGIN = "the policy"
 
 
-def policy_message(path: Path, run_id: str) -> PolicyVersion:
-    """Return the message that publishes a policy file.
+def policy_message(run_id: str, metadata: CheckpointMetadata, weights: bytes) -> PolicyVersion:
+    """Return the message that publishes a policy.
 
     Args:
-        path: the file.
         run_id: id of the training.
-
-    Raises:
-        UserError: the file is missing, damaged or foreign.
+        metadata: what the policy file says of itself.
+        weights: content of the policy file.
     """
-    try:
-        weights = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"policy {path} cannot be read: {error.strerror}") from error
-    metadata = checkpoint_from_bytes(weights, f"policy {path}").metadata
     return PolicyVersion(
         run_id=run_id,
         version=metadata.version,

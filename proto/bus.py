@@ -29,16 +29,23 @@ from proto.codec import MessageError, Text, Wire, decode, encode, message, schem
 from proto.config import HubConfig
 from proto.errors import UserError
 from proto.keys import Keys, Role
+from proto.lifecycle import Lifecycle
 from proto.plain_text import plain
 from proto.senders import Sender, is_id, origin_problem
 
 LOG = logging.getLogger(__name__)
 
 CONNECT_WAIT_S: Final = 5.0
-"""How long a process that starts waits for the hub."""
+"""How long one try to connect to the hub lasts."""
 SHARED_MEMORY_FROM_BYTES: Final = 64 * 1024
+_CONNECT_AGAIN_S: Final = 1.0
 _SENDERS_REMEMBERED: Final = 1000
 _HEARTBEAT_S: Final = 1.0
+
+
+class NoHubError(UserError):
+    """No hub answers, now."""
+
 
 M = TypeVar("M")
 Answer = TypeVar("Answer")
@@ -165,6 +172,8 @@ class Bus:
         self._newest: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._watched: dict[str, zenoh.Publisher] = {}
         self._complained_about: set[str] = set()
+        self._connection = threading.Lock()
+        self._hub_is_away = False
 
     def __enter__(self) -> Self:
         return self
@@ -176,6 +185,29 @@ class Bus:
     def peers(self) -> int:
         """Number of Zenoh sessions that are connected to this one."""
         return len(self._session.info.transports())
+
+    @property
+    def hub_is_away(self) -> bool:
+        """Whether the connection to the hub is lost; it is made again by itself."""
+        return self._hub_is_away
+
+    def log_connection(self, endpoint: str) -> None:
+        """Log from now on when the hub at an endpoint is lost, and when it is back."""
+        LOG.info("connected to the hub at %s", endpoint)
+
+        def on_change(_event: zenoh.TransportEvent) -> None:
+            with self._connection:
+                away = not self.peers
+                if away == self._hub_is_away or self._session.is_closed():
+                    return
+                self._hub_is_away = away
+            if away:
+                LOG.warning("lost the hub at %s; waiting for it", endpoint)
+            else:
+                LOG.info("the hub at %s is back", endpoint)
+
+        listener = self._session.info.declare_transport_events_listener(on_change)
+        self._declared.append(listener)
 
     def close(self) -> None:
         """Close the connection; further calls do nothing."""
@@ -427,7 +459,7 @@ def open_bus(config: HubConfig, run: str, role: Role, process: str) -> Bus:
     """Connect to the hub. A connection that is lost later is made again automatically.
 
     Raises:
-        UserError: no hub answers within CONNECT_WAIT_S.
+        NoHubError: no hub answers within CONNECT_WAIT_S.
     """
     settings = _settings(config, "client")
     settings["connect"] = {
@@ -440,10 +472,35 @@ def open_bus(config: HubConfig, run: str, role: Role, process: str) -> Bus:
     try:
         return Bus(_open(settings), run, role, process)
     except zenoh.ZError as error:
-        raise UserError(
+        raise NoHubError(
             f"no hub answers at {config.endpoint}: start one with `vmdnn hub`, or name the right "
             f"one with --connect tcp/HOST:PORT ({_reason(error)})"
         ) from error
+
+
+def join_hub(
+    config: HubConfig, run: str, role: Role, process: str, lifecycle: Lifecycle
+) -> Bus | None:
+    """Connect to the hub as soon as there is one; log when it is lost later and when it is back.
+
+    Returns:
+        The connection; None if the process was asked to stop before.
+    """
+    told = False
+    while not lifecycle.stopping:
+        lifecycle.waits_for(f"the hub at {config.endpoint}")
+        try:
+            bus = open_bus(config, run, role, process)
+        except NoHubError as error:
+            if not told:
+                LOG.warning("%s. Waiting for it", error)
+            told = True
+            lifecycle.wait(_CONNECT_AGAIN_S)
+        else:
+            lifecycle.waits_for("")
+            bus.log_connection(config.endpoint)
+            return bus
+    return None
 
 
 def open_hub(config: HubConfig, run: str, process: str) -> Bus:

@@ -103,7 +103,9 @@ _RETIRED_KEYS: Final = (
 class RunConfig(_Section):
     """Name and folder of the run, and the seed of all random numbers in its training."""
 
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")] = "experiment1"
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)] = (
+        "experiment1"
+    )
     folder: Annotated[Path, AfterValidator(_expand_home)] = Path("runs")
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 1
 
@@ -403,14 +405,31 @@ class EvaluatorConfig(_Section):
     lease_s: Positive = 60.0
 
 
-class RecorderConfig(_Section):
-    """Which rollouts are recorded.
+class KeepConfig(_Section):
+    """How many recordings are kept. Trials are never deleted; of practice the oldest go first.
 
     Attributes:
-        practice: record episodes of practice too, not only trials.
+        gib: size of all recordings (GiB); when it is reached, practice is deleted.
+        practice: number of recordings of practice.
     """
 
+    gib: Positive = 20.0
+    practice: Natural = 1000
+
+
+class RecorderConfig(_Section):
+    """Which rollouts are recorded, and how many are kept.
+
+    Attributes:
+        required: actors keep a rollout until the recorder has it too. False for a run without a
+            recorder.
+        practice: record episodes of practice too, not only trials.
+        keep: how many recordings are kept.
+    """
+
+    required: Switch = True
     practice: Switch = True
+    keep: KeepConfig = KeepConfig()
 
 
 class DoneConfig(_Section):
@@ -457,6 +476,13 @@ class Config(_Section):
         """Task of the pre-training sequences; None if those of coupled training are used."""
         first = self.learner.pretraining
         return None if first.epochs == 0 or first.task == self.task.name else first.task
+
+    @property
+    def policy_versions(self) -> int:
+        """Number of policy versions that the learner of a run publishes in all."""
+        learner = self.learner
+        initial = -(-learner.epochs // learner.publish_every_epochs)  # the last epoch counts too
+        return initial + learner.corrections.rounds
 
     def task_called(self, name: str) -> TaskConfig:
         """Return the section `task` for a task; another task has no options, the same attention."""

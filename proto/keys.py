@@ -66,16 +66,27 @@ class Keys:
         return f"vmdnn/{self.run}/sequence/{actor}"
 
     def rollout(self, actor: str = ANYONE) -> str:
-        """Actor to evaluator: `Rollout`."""
+        """Actor to evaluator and recorder: `Rollout`."""
         return f"vmdnn/{self.run}/rollout/{actor}"
 
     def failure(self, actor: str = ANYONE) -> str:
         """Actor to learner and evaluator: `EpisodeFailed`."""
         return f"vmdnn/{self.run}/failure/{actor}"
 
-    def receipt(self, actor: str) -> str:
-        """Learner and evaluator to actor: `Receipt`."""
-        return f"vmdnn/{self.run}/receipt/{actor}"
+    def receipt(self, role: Role | str, actor: str) -> str:
+        """Learner, evaluator or recorder (`role`) to actor: `Receipt`."""
+        return f"vmdnn/{self.run}/receipt/{role}/{actor}"
+
+    def renamed(self, key: str, actor: str) -> str:
+        """The key of this run under which an actor publishes what it kept under another run's name.
+
+        Raises:
+            ValueError: it is not the key of a sequence, a rollout or a failure.
+        """
+        channel = key.split("/")[-2:-1]
+        if channel not in (["sequence"], ["rollout"], ["failure"]):
+            raise ValueError(f"nothing is sent under the key {key!r}")
+        return f"vmdnn/{self.run}/{channel[0]}/{actor}"
 
     def live(self, actor: str = ANYONE) -> str:
         """Actor to anyone: `Live`."""

@@ -6,13 +6,14 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Final, Protocol
 
 from proto.bus import Bus
 from proto.errors import UserError
 from proto.lifecycle import Lifecycle
 from proto.messages import Command, Control, ControlReply
-from proto.metrics import Metrics
+from proto.metrics import METRICS, Metrics
 from proto.periodic import every
 
 LOG = logging.getLogger(__name__)
@@ -40,7 +41,9 @@ def membership(bus: Bus, participant: Participant, lifecycle: Lifecycle) -> Iter
         return ControlReply(bus.role, bus.id, _obey(control.command, participant, lifecycle))
 
     def publish_metrics() -> None:
-        bus.publish(bus.keys.metrics(bus.role, bus.id), participant.metrics())
+        lifecycle.log_wait()
+        metrics = replace(participant.metrics(), waiting_for=lifecycle.waiting_for[:500])
+        bus.publish(bus.keys.metrics(bus.role, bus.id), metrics)
 
     bus.answer(bus.keys.control(bus.role), Control, on_control)
     bus.announce()
@@ -55,20 +58,31 @@ def membership(bus: Bus, participant: Participant, lifecycle: Lifecycle) -> Iter
 def alone_in_run(bus: Bus, lifecycle: Lifecycle, *, patience_s: float = FROZEN_S) -> None:
     """Check, across all machines, that no other process of the run has this one's role.
 
-    A predecessor that froze keeps its liveliness token for FROZEN_S; so long this one waits.
+    A predecessor that froze keeps its liveliness token for FROZEN_S; so long this one waits. A
+    token whose owner publishes no metrics in this time does not count.
 
     Raises:
         UserError: another process has this role.
     """
+    heard: set[str] = set()
     patience_over_s = time.monotonic() + patience_s
+    listening = False
     while (others := bus.present(bus.role)) and not lifecycle.stopping:
+        if not listening:
+            bus.subscribe(bus.keys.metrics(bus.role), lambda m: heard.add(m.id), *METRICS)
+            listening = True
         if time.monotonic() > patience_over_s:
-            raise UserError(
-                f"run {bus.keys.run} has {bus.role.with_article} already "
-                f"({', '.join(sorted(others))}): "
-                "stop it, or choose another run with --set run.name=NAME"
-            )
+            if living := others & heard:
+                raise UserError(
+                    f"run {bus.keys.run} has {bus.role.with_article} already "
+                    f"({', '.join(sorted(living))}): "
+                    "stop it, or choose another run with --set run.name=NAME"
+                )
+            LOG.warning("ignores %s, which is present but silent", ", ".join(sorted(others)))
+            return
+        lifecycle.waits_for(f"the end of {bus.role.with_article} that this run has already")
         lifecycle.wait(0.2)
+    lifecycle.waits_for("")
 
 
 def _obey(command: Command, participant: Participant, lifecycle: Lifecycle) -> str:

@@ -92,8 +92,8 @@ class Rollout:
 class EpisodeFailed:
     """Report that the simulation of a requested episode failed, so that it has no outcome.
 
-    The evaluator counts the trial as a failure. The learner gives up a tutored case or a correction
-    that fails repeatedly.
+    The episode is handed out again. After three failures the evaluator counts the trial as a
+    failure, and the learner gives up the tutored case or correction.
 
     Attributes:
         id: id of the episode.

@@ -37,15 +37,17 @@ class Metrics:
         id: id of the process.
         time_s: when the metrics were published (Unix time).
         refused: messages that the process dropped because they were invalid.
+        waiting_for: what the process waits for, such as the hub; empty while it works.
     """
 
     role: Role
     id: Id
     time_s: Annotated[float, Number(0.0, 1e11)]
     refused: Count
+    waiting_for: Annotated[str, Text(500)] = ""
 
 
-@message("metrics.actor", 3, form="json")
+@message("metrics.actor", 4, form="json")
 @dataclass(frozen=True, kw_only=True)
 class ActorMetrics(Metrics):
     """Metrics of an actor.
@@ -163,7 +165,7 @@ class PolicyScore:
     reasons: Annotated[Mapping[str, int], Table(Integer(0), most=32)]
 
 
-@message("metrics.evaluator", 1, form="json", limit=4 * MEBIBYTE)
+@message("metrics.evaluator", 2, form="json", limit=4 * MEBIBYTE)
 @dataclass(frozen=True, kw_only=True)
 class EvaluatorMetrics(Metrics):
     """Metrics of the evaluator.
@@ -171,6 +173,7 @@ class EvaluatorMetrics(Metrics):
     Attributes:
         policies: the score of each policy version with counted trials, oldest first.
         leases: trials that are being played.
+        damaged: lines of the trial log that could not be read and are not counted.
         paused: whether it is paused.
         done: whether the evaluator's part of the configuration's `done` is reached.
     """
@@ -180,11 +183,12 @@ class EvaluatorMetrics(Metrics):
         tuple[PolicyScore, ...], Many(record_of(PolicyScore), Size("policies", 0, 10_000))
     ]
     leases: Count
+    damaged: Count
     paused: bool
     done: bool
 
 
-@message("metrics.recorder", 1, form="json")
+@message("metrics.recorder", 2, form="json")
 @dataclass(frozen=True, kw_only=True)
 class RecorderMetrics(Metrics):
     """Metrics of the recorder.
@@ -192,16 +196,19 @@ class RecorderMetrics(Metrics):
     Attributes:
         episodes: episodes written since it started.
         bytes: bytes written since it started.
-        dropped: rollouts that were not recorded, because its queue was full or writing failed.
+        dropped: rollouts that were dropped because its queue was full; their actors send them
+            again.
+        deleted: recordings of practice that were deleted because of `recorder.keep`.
     """
 
     role: Role = Role.RECORDER
     episodes: Count
     bytes: Count
     dropped: Count
+    deleted: Count
 
 
-@message("metrics.hub", 1, form="json")
+@message("metrics.hub", 2, form="json")
 @dataclass(frozen=True, kw_only=True)
 class HubMetrics(Metrics):
     """Metrics of the hub.

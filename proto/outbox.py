@@ -1,4 +1,4 @@
-"""Messages that must arrive: kept on disk until the receiver answers, and sent again until then."""
+"""Messages that must arrive: kept on disk, and sent again until all receivers have answered."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 from proto.codec import Wire
 from proto.errors import UserError
+from proto.keys import Role
 from proto.storage import change_suffix, make_folder, parts_in, written_whole
 
 LOG = logging.getLogger(__name__)
@@ -37,9 +38,12 @@ class _Entry:
         path: its file.
         sends: how often it was sent.
         sent_at_s: when it was sent last (monotonic clock).
+        missing: roles whose receipts have not come; empty as long as the file was not read: then
+            any receipt is the last one.
     """
 
     path: Path
+    missing: set[Role] = field(default_factory=set)
     sends: int = 0
     sent_at_s: float = float("-inf")
 
@@ -53,8 +57,8 @@ class Outbox:
     Messages that were sent least often go first, the oldest of them first: messages that nobody
     answers, such as those of another version, do not hold up the others.
 
-    A file is one line of JSON with key and encoding, followed by the payload. Used by several
-    threads.
+    A file is one line of JSON with key, encoding and receivers, followed by the payload. Used by
+    several threads.
     """
 
     def __init__(
@@ -100,27 +104,46 @@ class Outbox:
         """Number of messages that are kept but not sent any more: refused or damaged ones."""
         return self._put_aside
 
-    def add(self, name: str, key: str, wire: Wire) -> None:
+    @property
+    def missing(self) -> set[Role]:
+        """Roles whose receipts are missing."""
+        with self._lock:
+            return {role for entry in self._entries.values() for role in entry.missing}
+
+    def add(self, name: str, key: str, wire: Wire, receivers: Collection[Role] = ()) -> None:
         """Keep a message and send it.
 
         Args:
             name: the name by which the receiver's answer refers to the message.
             key: where it is sent.
             wire: the message.
+            receivers: roles from which a receipt must come; empty: one receipt is enough.
 
         Raises:
-            UserError: it cannot be written; then it is not sent.
+            StorageError: it cannot be written; then it is not sent.
         """
         path = self._folder / f"{time.time_ns()}-{name}.message"
-        header = json.dumps({"key": key, "encoding": wire.encoding}).encode()
+        values = {"key": key, "encoding": wire.encoding, "receivers": sorted(receivers)}
+        header = json.dumps(values).encode()
         with written_whole(path) as stream:
             stream.write(header + b"\n" + wire.payload)
         with self._lock:
-            self._entries[name] = _Entry(path)
+            self._entries[name] = _Entry(path, set(receivers))
         self.send_due()
 
-    def received(self, name: str) -> None:
-        """Delete a message whose receipt has come. Unknown names are ignored."""
+    def received(self, name: str, receiver: Role | None = None) -> None:
+        """Delete a message of which all receipts have come. Unknown names are ignored.
+
+        Args:
+            name: the name of the message.
+            receiver: role of the process whose receipt has come.
+        """
+        with self._lock:
+            waiting = self._entries.get(name)
+            if waiting is not None and waiting.missing and receiver is not None:
+                waiting.missing.discard(receiver)
+                if waiting.missing:
+                    return
         entry = self._answered(name)
         if entry is not None:
             entry.path.unlink(missing_ok=True)
@@ -172,10 +195,12 @@ class Outbox:
         try:
             header, _, payload = entry.path.read_bytes().partition(b"\n")
             values = json.loads(header)
+            if entry.sends == 1:  # it may be a former process's
+                entry.missing = {Role(role) for role in values.get("receivers", ())}
             self._send(values["key"], Wire(values["encoding"], payload))
         except FileNotFoundError:
             pass  # its answer came in between
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             with self._lock:
                 self._entries.pop(name, None)
             self._set_aside(entry.path, ".damaged", f"is damaged ({error})")

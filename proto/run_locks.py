@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import itertools
+import logging
 import re
 import socket
 from collections.abc import Iterator
@@ -14,6 +15,24 @@ from proto.errors import UserError
 from proto.keys import Role
 from proto.storage import make_folder, storage_errors
 
+LOG = logging.getLogger(__name__)
+
+
+@contextmanager
+def owned_run(run_folder: Path) -> Iterator[None]:
+    """Hold the lock of whoever starts the processes of a run, until the context ends.
+
+    Raises:
+        UserError: the run is being played already.
+    """
+    with _lock(run_folder, "run_local") as held:
+        if not held:
+            raise UserError(
+                f"the run in {run_folder} is being played already: stop it, or choose another "
+                "run with --set run.name=NAME"
+            )
+        yield
+
 
 @contextmanager
 def only_one(run_folder: Path, role: Role, name: str) -> Iterator[None]:
@@ -22,7 +41,7 @@ def only_one(run_folder: Path, role: Role, name: str) -> Iterator[None]:
     Raises:
         UserError: another process holds it.
     """
-    with _lock(run_folder, role, name) as held:
+    with _lock(run_folder, f"{role}-{name}") as held:
         if not held:
             raise UserError(
                 f"{role.with_article} with the id {name!r} already works in {run_folder}: stop it, "
@@ -63,22 +82,23 @@ def own_id(run_folder: Path, role: Role, wanted: str | None) -> Iterator[str]:
         return
     host = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40] or "host"
     for number in itertools.count(1):
-        with _lock(run_folder, role, f"{host}-{number}") as held:
+        with _lock(run_folder, f"{role}-{host}-{number}") as held:
             if held:
                 yield f"{host}-{number}"
                 return
 
 
 @contextmanager
-def _lock(run_folder: Path, role: Role, name: str) -> Iterator[bool]:
+def _lock(run_folder: Path, name: str) -> Iterator[bool]:
     """Try to lock; gives whether this process holds the lock.
 
-    The operating system frees the lock of a process that dies.
+    The operating system frees the lock of a process that dies. A file system without locks is
+    told, and does not stop anyone.
 
     Raises:
         UserError: the lock's file cannot be made.
     """
-    path = run_folder / "locks" / f"{role}-{name}"
+    path = run_folder / "locks" / name
     make_folder(path.parent)
     with storage_errors(path):
         file = path.open("ab")
@@ -88,4 +108,10 @@ def _lock(run_folder: Path, role: Role, name: str) -> Iterator[bool]:
         except BlockingIOError:
             yield False
             return
+        except OSError as error:  # such as ENOSYS, ENOLCK
+            LOG.warning(
+                "%s cannot be locked (%s): make sure yourself that no other process uses it",
+                path,
+                error.strerror,
+            )
         yield True

@@ -20,7 +20,11 @@ from proto.errors import UserError
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 
 
-class DiskFullError(UserError):
+class StorageError(UserError):
+    """A file cannot be written. This may pass: a process that runs waits until it can."""
+
+
+class DiskFullError(StorageError):
     """A file cannot be written because its file system, or the user's quota on it, is full."""
 
 
@@ -33,7 +37,7 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
 
     Raises:
         DiskFullError: no space is left.
-        UserError: the file cannot be written for another reason.
+        StorageError: the file cannot be written for another reason.
     """
     make_folder(path.parent)
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
@@ -59,7 +63,7 @@ def append_line(path: Path, line: bytes) -> None:
 
     Raises:
         DiskFullError: no space is left.
-        UserError: the file cannot be written for another reason.
+        StorageError: the file cannot be written for another reason.
     """
     make_folder(path.parent)
     with storage_errors(path), path.open("ab", buffering=0) as stream:
@@ -80,7 +84,7 @@ def drop_unfinished_line(path: Path) -> bool:
     A missing file is left missing.
 
     Raises:
-        UserError: the file cannot be written.
+        StorageError: the file cannot be written.
     """
     if not path.exists():
         return False
@@ -99,7 +103,7 @@ def make_folder(folder: Path) -> None:
 
     Raises:
         DiskFullError: no space is left.
-        UserError: it cannot be made for another reason.
+        StorageError: it cannot be made for another reason.
     """
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     with storage_errors(folder):
@@ -108,17 +112,57 @@ def make_folder(folder: Path) -> None:
             _sync_folder(made.parent)
 
 
+def link_file(path: Path, other: Path) -> None:
+    """Make `other` a second name of a file, which keeps its content when `path` is replaced.
+
+    On a file system without links it becomes a copy.
+
+    Raises:
+        DiskFullError: no space is left.
+        StorageError: it cannot be made for another reason.
+    """
+    part = other.with_name(f"{other.name}.{secrets.token_hex(4)}.part")
+    with storage_errors(other):
+        try:
+            os.link(path, part)
+        except OSError:
+            with written_whole(other) as stream, path.open("rb") as source:
+                shutil.copyfileobj(source, stream)
+            return
+        part.replace(other)
+        _sync_folder(other.parent)
+
+
+def delete_file(path: Path) -> None:
+    """Delete a file; a missing one is ignored.
+
+    Raises:
+        StorageError: it cannot be deleted.
+    """
+    with storage_errors(path):
+        path.unlink(missing_ok=True)
+
+
 def change_suffix(path: Path, suffix: str) -> Path:
     """Rename a file so that its name ends with another suffix; gives the new path.
 
     Raises:
-        UserError: there is no such file, or it cannot be renamed.
+        StorageError: there is no such file, or it cannot be renamed.
     """
     renamed = path.with_suffix(suffix)
+    rename(path, renamed)
+    return renamed
+
+
+def rename(path: Path, renamed: Path) -> None:
+    """Give a file or a folder another name.
+
+    Raises:
+        StorageError: it does not exist, or cannot be renamed.
+    """
     with storage_errors(renamed):
         path.rename(renamed)
         _sync_folder(renamed.parent)
-    return renamed
 
 
 @contextmanager
@@ -127,14 +171,14 @@ def storage_errors(path: Path) -> Iterator[None]:
 
     Raises:
         DiskFullError: no space is left.
-        UserError: the file cannot be written for another reason.
+        StorageError: the file cannot be written for another reason.
     """
     try:
         yield
     except OSError as error:
         if error.errno in _FULL:
             raise DiskFullError(_full_words(path, error)) from error
-        raise UserError(
+        raise StorageError(
             f"{path} cannot be written: {error.strerror or error}; check that the folder exists "
             "and that you may write there, or choose another one"
         ) from error

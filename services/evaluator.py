@@ -8,10 +8,12 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from learner.policy_message import policy_of
+from learner.tutoring.failures import Failures
 from proto.acceptance import PlayedTask, misfit, same_situation
 from proto.agreement import OTHER_SETTINGS, Agreement
 from proto.bus import Bus
 from proto.config import Config
+from proto.disk_waits import when_disk_allows
 from proto.episode import Episode, Kind, Outcome
 from proto.errors import UserError
 from proto.keys import Role
@@ -70,6 +72,7 @@ class Evaluator:
         self._leases: Leases[tuple[PolicyKey, int]] = Leases(config.evaluator.lease_s)
         first = config.evaluator.seed
         self._seeds = range(first, first + config.evaluator.trials_per_policy)
+        self._failures: Failures[tuple[PolicyKey, int]] = Failures()
         self._task = task
         self._agreement = Agreement(config, bus)
         self._folder = config.run_folder / "evaluation"
@@ -96,7 +99,8 @@ class Evaluator:
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
         with membership(self._bus, self, self._lifecycle):
             while not self._lifecycle.stopping:
-                rollouts.handle(self._on_rollout, timeout_s=IDLE_S)
+                came = rollouts.handle(self._on_rollout, timeout_s=IDLE_S)
+                self._lifecycle.waits_for("" if came else self._missing)
                 while failures.handle(self._on_failure):
                     pass
 
@@ -112,6 +116,7 @@ class Evaluator:
                 for version in self._log.versions(run_id)[-VERSIONS_TOLD:]
             ),
             leases=len(self._leases),
+            damaged=self._log.damaged,
             paused=self._lifecycle.paused,
             done=self._done,
         )
@@ -165,7 +170,7 @@ class Evaluator:
             return
         if not refusal and episode.kind is Kind.TRIAL:
             self._leases.finish(((rollout.run_id, episode.policy_version), episode.seed))
-            if self._log.add(rollout):
+            if when_disk_allows(self._lifecycle, lambda: self._log.add(rollout)):
                 _report_trial(episode.policy_version, episode.seed, episode.outcome.reason)
         elif not refusal:
             self._bus.deliver(self._bus.keys.verdict, _verdict(rollout))
@@ -180,8 +185,10 @@ class Evaluator:
         except NotYetError:
             return
         if not refusal:
-            self._leases.finish(((report.training, report.policy_version), report.seed))
-            if self._log.add_failure(report):
+            trial = (report.training, report.policy_version), report.seed
+            self._leases.finish(trial)
+            # Otherwise the trial is handed out again.
+            if self._failures.add(trial, report.id) and self._count_failure(report):
                 _report_trial(report.policy_version, report.seed, report.problem)
         self._answer(report.actor, Receipt(report.id, self._told(report.actor, refusal)))
 
@@ -190,6 +197,20 @@ class Evaluator:
         if refusal:
             self._bus.refuse(f"actor/{actor}", refusal)
         return plain(refusal)[:1000]
+
+    def _count_failure(self, report: EpisodeFailed) -> bool:
+        return when_disk_allows(self._lifecycle, lambda: self._log.add_failure(report))
+
+    @property
+    def _missing(self) -> str:
+        """What it waits for while no rollout arrives."""
+        if self._bus.hub_is_away:
+            return "the hub"
+        _, version = newest = self._asked.newest
+        if not version:
+            return "a policy"
+        left = len(self._seeds) - len(self._counted(newest))
+        return f"{left} trials of policy {version}" if left else "the next policy"
 
     def _refusal(self, played: Episode | EpisodeFailed) -> str:
         """Why an episode is no trial and no practice of this run; empty if it is one.
@@ -232,7 +253,7 @@ class Evaluator:
         return misfit(rollout.episode, self._task, self._config.simulator.control_period_s)
 
     def _answer(self, actor: str, receipt: Receipt) -> None:
-        self._bus.deliver(self._bus.keys.receipt(actor), receipt)
+        self._bus.deliver(self._bus.keys.receipt(Role.EVALUATOR, actor), receipt)
 
     def _counted(self, policy: PolicyKey) -> Mapping[int, Outcome]:
         outcomes = self._log.outcomes(*policy)

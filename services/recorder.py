@@ -1,56 +1,64 @@
 """The recorder: writes every rollout to disk.
 
-It only listens. The evaluator does not wait for it: a rollout that is published while no recorder
-runs is counted but not recorded. The learner keeps the tutored sequences, in the same file format.
+Actors keep a rollout until its receipt has come from the recorder as well as from the evaluator.
+The learner keeps the tutored sequences, in the same file format.
 """
 
 from __future__ import annotations
 
 import logging
 import time
+from pathlib import Path
 from typing import Final
 
 from proto.agreement import OTHER_SETTINGS, digest_of, settings_of
 from proto.bus import Bus, Inbox
 from proto.config import Config
+from proto.disk_waits import when_disk_allows
 from proto.episode import Episode, Kind
 from proto.errors import UserError
+from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import membership
-from proto.messages import Rollout
+from proto.messages import Receipt, Rollout
 from proto.metrics import RecorderMetrics
 from proto.recordings.episodes import write_episode
 from proto.recordings.schemas import SceneUpdate
+from services.recordings import Recordings
 from services.robot_meshes import robot_meshes
 
 LOG = logging.getLogger(__name__)
 
 WAITING: Final = 64
-"""Rollouts that may wait to be written; when more arrive, the oldest are dropped."""
+"""Rollouts that may wait to be written; when more arrive, the oldest are dropped and sent again."""
 
 
 class Recorder:
     """Writes each rollout once, as `<id>.mcap`, into the run's `rollouts` folder."""
 
     def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
-        """Start to collect rollouts."""
-        self._folder = config.run_folder / "rollouts"
-        self._practice = config.recorder.practice
+        """Find what was recorded before, and start to collect rollouts."""
+        self._config = config.recorder
         self._task = config.task.name
         self._digest = digest_of(settings_of(config))
         self._bus = bus
         self._lifecycle = lifecycle
+        self._recordings = Recordings(config.run_folder / "rollouts", config.recorder.keep)
         self._inbox: Inbox[Rollout] = bus.inbox(bus.keys.rollout(), Rollout, capacity=WAITING)
         self._robot = _robot()
         self._episodes = 0
         self._bytes = 0
-        self._failed = 0
 
     def run(self) -> None:
-        """Record until it should stop, and then what still waits."""
+        """Record until it should stop, and then what still waits.
+
+        Raises:
+            StorageError: it should stop, and a rollout cannot be written to disk.
+        """
         with membership(self._bus, self, self._lifecycle):
             while not self._lifecycle.stopping or len(self._inbox):
                 rollout = self._inbox.take(timeout_s=0.5)
+                self._lifecycle.waits_for("" if rollout else self._missing)
                 if rollout is not None and self._is_recorded(rollout.episode):
                     self._record(rollout.episode)
 
@@ -62,32 +70,40 @@ class Recorder:
             refused=self._bus.refused,
             episodes=self._episodes,
             bytes=self._bytes,
-            dropped=self._inbox.dropped + self._failed,
+            dropped=self._inbox.dropped,
+            deleted=self._recordings.deleted,
         )
 
     def checkpoint(self) -> str:
         """Write nothing: a rollout is on disk as soon as it is recorded."""
-        return f"{self._episodes} rollouts are in {self._folder}"
+        return f"{self._episodes} rollouts are in {self._recordings.folder}"
+
+    @property
+    def _missing(self) -> str:
+        return "the hub" if self._bus.hub_is_away else "a rollout"
 
     def _is_recorded(self, episode: Episode) -> bool:
         """Whether an episode is a rollout of this run that is to be recorded."""
         if episode.task != self._task or episode.config_digest != self._digest:
             self._bus.refuse(f"actor/{episode.actor}", OTHER_SETTINGS)
             return False
-        return episode.kind is Kind.TRIAL or (self._practice and episode.kind is Kind.PRACTICE)
+        return episode.kind is Kind.TRIAL or (
+            self._config.practice and episode.kind is Kind.PRACTICE
+        )
 
     def _record(self, episode: Episode) -> None:
-        path = self._folder / f"{episode.id}.mcap"
-        if path.exists():  # the actor sent it again because its receipt was late
-            return
-        try:
-            write_episode(path, episode, robot=self._robot)
-        except UserError as error:  # such as a full disk, on which space may be freed later
-            self._failed += 1
-            LOG.warning("rollout %s is not recorded: %s", episode.id, error)
-            return
-        self._episodes += 1
-        self._bytes += path.stat().st_size
+        """Write a rollout unless it is there already, such as one that was sent again."""
+        path = self._recordings.path(episode)
+        if not path.exists():
+            self._write(path, episode)
+            self._episodes += 1
+            self._bytes += path.stat().st_size
+            self._recordings.add(path, episode.kind)
+        receipt = self._bus.keys.receipt(Role.RECORDER, episode.actor)
+        self._bus.deliver(receipt, Receipt(episode.id))
+
+    def _write(self, path: Path, episode: Episode) -> None:
+        when_disk_allows(self._lifecycle, lambda: write_episode(path, episode, robot=self._robot))
 
 
 def _robot() -> SceneUpdate | None:

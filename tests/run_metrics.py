@@ -40,7 +40,7 @@ def score(version: int, strict: int, trials: int) -> PolicyScore:
 
 EVALUATOR = EvaluatorMetrics(
     id="e", time_s=1.0, refused=0, policies=(score(2, 3, 10), score(3, 44, 52)), leases=1,
-    paused=False, done=False,
+    damaged=0, paused=False, done=False,
 )  # fmt: skip
 
 

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from pathlib import Path
 
-from learner.checkpoint import policy_file, pretraining_file, training_file
+from learner.checkpoint import (
+    load_checkpoint,
+    policy_file,
+    pretraining_file,
+    previous_training_file,
+    training_file,
+)
 from learner.training.recipe import Recipe
 from learner.training.trainer import Trainer
 from learner.tutoring.store import TutoringStore
+from proto.errors import UserError
 from proto.metrics import Stage
-from proto.storage import written_whole
+from proto.storage import StorageError, change_suffix, link_file, written_whole
+
+LOG = logging.getLogger(__name__)
 
 
 def open_training(
@@ -23,6 +33,9 @@ def open_training(
 ) -> Trainer:
     """Go on with the training in a run's folder, or start it if there is none.
 
+    If the newest checkpoint is damaged or gone, the one before is used: what was trained since then
+    is trained again. The damaged file gets the suffix `.damaged`.
+
     Args:
         recipe: the network, and how it is trained.
         folder: the run's folder.
@@ -32,12 +45,54 @@ def open_training(
             need actors.
 
     Raises:
-        UserError: the folder has a training of another network, or a damaged one.
+        UserError: the folder has a training of another network, or all its checkpoints are damaged.
     """
-    path = training_file(folder)
-    if path.exists():
+    path = _usable_training_file(folder)
+    if path is not None:
         return Trainer.restore(path, recipe, store, pretraining_store, rounds=rounds)
     return Trainer(recipe, store, pretraining_store, rounds=rounds)
+
+
+def _usable_training_file(folder: Path) -> Path | None:
+    """The newest checkpoint that can be read; None if there never was one.
+
+    Raises:
+        UserError: there are checkpoints, but all are damaged.
+    """
+    newest, previous = training_file(folder), previous_training_file(folder)
+    problem = f"{newest} is gone"
+    if newest.exists():
+        try:
+            load_checkpoint(newest)
+        except UserError as error:
+            problem = str(error)
+        else:
+            return newest
+    elif not previous.exists():
+        return None
+    try:
+        load_checkpoint(previous)
+    except UserError as error:
+        raise UserError(
+            f"{problem}, and there is no checkpoint before it that can be used. To start the "
+            f"training anew with the same sequences, move the folder {newest.parent} away"
+        ) from error
+    LOG.warning("%s. The training goes on from the checkpoint before, %s", problem, previous)
+    if newest.exists():
+        change_suffix(newest, ".damaged")
+    return previous
+
+
+def save_training(trainer: Trainer, folder: Path) -> None:
+    """Write everything that `open_training` needs; the checkpoint before is kept, too.
+
+    Raises:
+        StorageError: the file cannot be written there.
+    """
+    newest = training_file(folder)
+    if newest.exists():
+        link_file(newest, previous_training_file(folder))
+    trainer.save(newest)
 
 
 def run_training(trainer: Trainer, folder: Path, go_on: Callable[[float], bool]) -> None:
@@ -60,8 +115,8 @@ def run_training(trainer: Trainer, folder: Path, go_on: Callable[[float], bool])
         if policy_is_due(trainer):
             write_policy(trainer, folder)
         if trainer.epochs_done % checkpoint_every == 0:
-            trainer.save(training_file(folder))
-    trainer.save(training_file(folder))
+            save_training(trainer, folder)
+    save_training(trainer, folder)
 
 
 def pretraining_is_over(trainer: Trainer) -> bool:
@@ -84,9 +139,25 @@ def policy_is_due(trainer: Trainer) -> bool:
 def write_policy(trainer: Trainer, folder: Path) -> None:
     """Write the network as the next policy version into the run's folder.
 
+    A policy that is there is never overwritten: if it is the same, because a killed training was
+    computed again, nothing is written; otherwise the next free version is taken.
+
     Raises:
-        UserError: the file cannot be written there.
+        StorageError: the file cannot be written there; nothing has changed.
     """
-    version = trainer.version + 1
-    with written_whole(policy_file(folder, version)) as stream:
-        stream.write(trainer.policy_bytes(version))
+    before = version = trainer.version
+    while True:
+        version += 1
+        content, file = trainer.policy_bytes(version), policy_file(folder, version)
+        damaged = file.with_suffix(".damaged").exists()
+        if not file.exists() and not damaged:
+            break
+        if not damaged and file.read_bytes() == content:
+            return
+        LOG.warning("policy %d exists already and is another one; it stays as it is", version)
+    try:
+        with written_whole(file) as stream:
+            stream.write(content)
+    except StorageError:
+        trainer.version = before
+        raise

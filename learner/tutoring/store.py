@@ -17,7 +17,7 @@ from proto.recordings.episodes import (
     read_summary,
     write_episode,
 )
-from proto.storage import change_suffix
+from proto.storage import StorageError, change_suffix
 
 LOG = logging.getLogger(__name__)
 
@@ -27,15 +27,22 @@ Read = TypeVar("Read")
 class TutoringStore:
     """The sequences in a folder; another store of the same folder has the same ones.
 
-    One thread may add while another reads. A file that cannot be read is left where it is, logged
-    once, and counts as missing: its episode may be added again.
+    One thread may add while another reads. A file that cannot be read is logged once and counts as
+    missing: its episode may be added again. It is left where it is, or gets the suffix `.damaged`.
 
     Attributes:
         folder: where the files are; it is made for the first one.
         damaged: what is wrong with each file that could not be read or was set aside, by id.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, sets_aside: bool = False) -> None:
+        """Find the sequences in a folder.
+
+        Args:
+            folder: where the files are.
+            sets_aside: rename files that cannot be read.
+        """
+        self._sets_aside = sets_aside
         self.folder = folder
         self.damaged: dict[str, str] = {}
         self._lock = Lock()
@@ -80,6 +87,7 @@ class TutoringStore:
             with self._lock:
                 self._ids.discard(sequence)
                 self.damaged[sequence] = str(error)
+            self._set_aside(self._path(sequence))
             return None
 
     def set_aside(self, sequence: str, problem: str) -> None:
@@ -95,9 +103,17 @@ class TutoringStore:
             self.damaged[sequence] = problem
         try:
             kept = f"it is kept as {change_suffix(path, '.refused')}"
-        except UserError as error:
+        except StorageError as error:
             kept = f"it cannot be renamed: {error}"
         LOG.warning("nothing is learned from %s: %s; %s", path, plain(problem), kept)
+
+    def _set_aside(self, path: Path) -> None:
+        if not self._sets_aside or not path.exists():
+            return
+        try:
+            LOG.warning("it is kept as %s", change_suffix(path, ".damaged"))
+        except StorageError as error:
+            LOG.warning("it cannot be put aside: %s", error)
 
     def _path(self, sequence: str) -> Path:
         return self.folder / f"{sequence}.mcap"

@@ -214,6 +214,21 @@ def read_summary(path: Path) -> EpisodeSummary:
         raise _not_an_episode(path, error) from error
 
 
+def read_kind(path: Path) -> Kind:
+    """Read why an episode was played; only the beginning of the file is read.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    try:
+        for record in records(path):
+            if isinstance(record, Metadata) and record.name == "episode":
+                return Kind(record.metadata["kind"])
+    except DAMAGE as error:
+        raise UserError(f"{path} is damaged ({error!r})") from error
+    raise UserError(f"{path} is no recording of an episode")
+
+
 def records(path: Path) -> Iterator[McapRecord]:
     """Yield all records of an MCAP file in order; unpack chunks and verify checksums.
 

@@ -34,6 +34,11 @@ def run_tables(view: RunView) -> RenderableType:
         for m in view.living(RecorderMetrics)
     ]
     parts += [
+        Text(plain(f"{role} {name} waits for {metrics.waiting_for}"))
+        for (role, name), metrics in sorted(view.metrics.items())
+        if metrics.waiting_for and (role, name) not in view.vanished_s
+    ]
+    parts += [
         Text(plain(f"{role} {name} is gone for {time.time() - since_s:.0f} s"), style="red")
         for (role, name), since_s in sorted(view.vanished_s.items())
     ]

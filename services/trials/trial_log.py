@@ -122,7 +122,11 @@ def _parse_line(line: bytes) -> CountedTrial:
 
 
 class TrialLog:
-    """Counts each trial of each policy version once, also across restarts."""
+    """Counts each trial of each policy version once, also across restarts.
+
+    Attributes:
+        damaged: number of lines that could not be read; they stay in the file and are not counted.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open a trial log, or create it.
@@ -130,6 +134,7 @@ class TrialLog:
         A last line that is incomplete, because a process was killed, is dropped.
         """
         self._path = path
+        self.damaged = 0
         self._outcomes: dict[tuple[str, int], dict[int, Outcome]] = defaultdict(dict)
         if drop_unfinished_line(path):
             LOG.warning("%s: dropped its last line, which was not finished", path)
@@ -187,4 +192,5 @@ class TrialLog:
         try:
             self._count(_parse_line(line))
         except MessageError as error:
+            self.damaged += 1
             LOG.warning("%s, line %d is not counted: %s", self._path, number, error)

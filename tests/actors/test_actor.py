@@ -16,14 +16,21 @@ import numpy as np
 import pytest
 from fitting import make_policy
 from ports import free_endpoint
-from processes import eventually, listening_hub, run_vmdnn, stop, vmdnn
+from processes import eventually, listening_hub, stop, vmdnn
 
+from actors.left_outboxes import LeftOutboxes
+from actors.receipts import Receipts
 from actors.tasks.experiment1.plan import plan
 from actors.tasks.registry import make_task
 from proto.bus import Bus, open_bus
-from proto.config import HubConfig, TaskConfig, load_config
+from proto.codec import encode
+from proto.config import (
+    HubConfig,
+    TaskConfig,
+    load_config,
+)
 from proto.episode import Episode, Kind
-from proto.keys import Role
+from proto.keys import Keys, Role
 from proto.messages import (
     Command,
     Control,
@@ -41,7 +48,8 @@ from proto.messages import (
     TutoringRequest,
 )
 from proto.metrics import ActorMetrics
-from proto.outbox import IN_FLIGHT
+from proto.outbox import IN_FLIGHT, Outbox
+from proto.run_locks import own_id
 from proto.seeds import PRACTICE
 
 MakeEpisode = Callable[..., Episode]
@@ -55,7 +63,7 @@ def policy() -> Callable[..., PolicyVersion]:
 
 
 class ActorSetup:
-    """A hub, an actor, and sessions that play the roles of learner and evaluator."""
+    """A hub, an actor, and sessions that play the roles of learner, evaluator and recorder."""
 
     def __init__(self, stack: ExitStack, folder: Path) -> None:
         self._stack = stack
@@ -75,6 +83,7 @@ class ActorSetup:
         self.metrics: ActorMetrics | None = None
         self.failures: list[EpisodeFailed] = []
         self.gives_receipts = True
+        self.recorders = [Role.RECORDER]
         self.refusal = ""
         self.hub: Popen[bytes]
         self.actor: Popen[bytes]
@@ -82,10 +91,12 @@ class ActorSetup:
         self.bus: Bus = stack.enter_context(
             open_bus(HubConfig(endpoint=self.endpoint), "test", Role.LEARNER, "learner")
         )
-        self.evaluator: Bus = stack.enter_context(
-            open_bus(HubConfig(endpoint=self.endpoint), "test", Role.EVALUATOR, "evaluator")
-        )
-        for bus in (self.bus, self.evaluator):
+        self.receivers: dict[Role, Bus] = {Role.LEARNER: self.bus}
+        for role in (Role.EVALUATOR, Role.RECORDER):
+            self.receivers[role] = stack.enter_context(
+                open_bus(HubConfig(endpoint=self.endpoint), "test", role, str(role))
+            )
+        for bus in self.receivers.values():
             bus.announce()
         self._lock = threading.Lock()
         keys = self.bus.keys
@@ -132,26 +143,27 @@ class ActorSetup:
 
     def _on_sequence(self, sequence: Sequence) -> None:
         self.sequences.append(sequence.episode)
-        self._acknowledge(sequence.episode)
+        self._acknowledge(sequence.episode, Role.LEARNER)
 
     def _on_rollout(self, rollout: Rollout) -> None:
         self.rollouts.append(rollout)
-        self._acknowledge(rollout.episode)
+        self._acknowledge(rollout.episode, Role.EVALUATOR, *self.recorders)
 
     def _on_metrics(self, metrics: ActorMetrics) -> None:
         self.metrics = metrics
 
     def _on_failure(self, report: EpisodeFailed) -> None:
         self.failures.append(report)
-        sender = self.evaluator if report.kind is Kind.TRIAL else self.bus
-        sender.deliver(self.bus.keys.receipt(report.actor), Receipt(report.id))
+        role = Role.EVALUATOR if report.kind is Kind.TRIAL else Role.LEARNER
+        self._give(role, report.actor, Receipt(report.id))
 
-    def _acknowledge(self, episode: Episode) -> None:
-        if self.gives_receipts:
+    def _acknowledge(self, episode: Episode, *roles: Role) -> None:
+        for role in roles if self.gives_receipts else ():
             receipt = Receipt(episode.id, self.refusal)
-            rollout = episode.kind in (Kind.TRIAL, Kind.PRACTICE)
-            sender = self.evaluator if rollout else self.bus
-            sender.deliver(self.bus.keys.receipt(episode.actor), receipt)
+            self._give(role, episode.actor, receipt)
+
+    def _give(self, role: Role, actor: str, receipt: Receipt) -> None:
+        self.receivers[role].deliver(self.bus.keys.receipt(role, actor), receipt)
 
 
 @pytest.fixture
@@ -292,15 +304,17 @@ def test_receipts_of_those_who_store_nothing_delete_nothing(setup: ActorSetup) -
     setup.start_actor()
     eventually(lambda: len(setup.sequences) >= 1, "a demonstration")
     receipt = Receipt(setup.sequences[0].id)
-    key = setup.bus.keys.receipt("actor-1")
+    key = setup.bus.keys.receipt(Role.LEARNER, "actor-1")
+    evaluator = setup.receivers[Role.EVALUATOR]
     hub = HubConfig(endpoint=setup.endpoint)
     with (
         open_bus(hub, "test", Role.WATCH, "stranger") as stranger,
         open_bus(hub, "test", Role.LEARNER, "absent") as absent,
     ):
-        for bus in (stranger, absent, setup.evaluator):
+        evaluator.deliver(setup.bus.keys.receipt(Role.EVALUATOR, "actor-1"), receipt)
+        for bus in (stranger, absent, evaluator):
             bus.deliver(key, receipt)
-        metrics = setup.wait_for_metrics(lambda metrics: metrics.refused == 2)
+        metrics = setup.wait_for_metrics(lambda metrics: metrics.refused == 3)
     assert metrics.outbox == 1
     setup.bus.deliver(key, receipt)
     setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
@@ -431,9 +445,63 @@ def test_when_stopped_it_aborts_its_episode_and_ends_cleanly(
     assert setup.bus.present(Role.ACTOR) == set()
 
 
-def test_without_a_hub_it_prints_what_to_do(tmp_path: Path) -> None:
-    words = ("--connect", free_endpoint(), "--set", f"run.folder={tmp_path}")
-    ended = run_vmdnn("actor", *words)
-    assert ended.returncode == 2
-    assert "start one with `vmdnn hub`" in ended.stderr
-    assert "Traceback" not in ended.stderr
+def leave_sequences(setup: ActorSetup, make_episode: MakeEpisode, actor: str) -> None:
+    """Put sequences into an actor's outbox, with the keys of a run of another name."""
+    left = Outbox(setup.outbox.parent / actor / "sequences", lambda *_: None)
+    for number in range(IN_FLIGHT):
+        episode = make_episode(20, id=f"{actor}-{number}", actor=actor)
+        key = Keys("former-name").sequence(actor)
+        left.add(episode.id, key, encode(Sequence(episode)), [Role.LEARNER])
+
+
+def test_what_a_renamed_run_left_in_its_outboxes_arrives(
+    setup: ActorSetup, make_episode: MakeEpisode
+) -> None:
+    leave_sequences(setup, make_episode, "actor-1")
+    setup.start_actor()
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
+    assert len({episode.id for episode in setup.sequences}) == IN_FLIGHT
+    assert not list(setup.outbox.glob("*/*"))
+
+
+def test_an_actor_sends_what_actors_left_that_are_gone_for_good(
+    setup: ActorSetup, make_episode: MakeEpisode
+) -> None:
+    leave_sequences(setup, make_episode, "gone-1")
+    run_folder = setup.outbox.parents[1]
+    config = HubConfig(endpoint=setup.endpoint)
+    with open_bus(config, "test", Role.ACTOR, "another-1") as bus:
+        receipts = Receipts(bus)
+        waits = LeftOutboxes(run_folder, bus, receipts)
+        waits.look()
+        assert len(waits) == 0, "it may come back"
+        left = LeftOutboxes(run_folder, bus, receipts, gone_after_s=0.0)
+        with own_id(run_folder, Role.ACTOR, "gone-1"):
+            left.look()
+            assert len(left) == 0, "it is about to come back"
+        left.look()
+        with own_id(run_folder, Role.ACTOR, "gone-1"):
+            pass  # it can come back even now
+
+        def all_sent() -> bool:
+            left.look()
+            return len(left) == 0 and len(setup.sequences) >= IN_FLIGHT
+
+        eventually(all_sent, "all receipts have come")
+        left.close()
+    assert not list((run_folder / "outbox" / "gone-1").glob("*/*"))
+
+
+def test_a_rollout_stays_until_the_recorder_has_it_too(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    setup.recorders.clear()
+    setup.trials.append(Trial(seed=1234))
+    setup.publish(policy(1))
+    setup.start_actor("--set", "actor.practice=false")
+    eventually(lambda: len(setup.rollouts) == 1, "a trial")
+    eventually(lambda: len(setup.rollouts) == 2, "it is sent again")
+    metrics = setup.wait_for_metrics(lambda metrics: bool(metrics.waiting_for))
+    assert (metrics.outbox, metrics.waiting_for) == (1, "receipts of the recorder")
+    setup.recorders.append(Role.RECORDER)
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
 import subprocess
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 from ports import free_endpoint
 from processes import eventually
 
-from deploy.run_local import (
-    DEFAULT_CONFIG,
-    TOO_MANY_CRASHES,
-    Crashes,
-    ProcessFailedError,
-    main,
-    programs,
-)
-from deploy.supervision import ProcessState
+from deploy.run_local import DEFAULT_CONFIG, main, programs
 from proto.config import Config, LearnerConfig, load_config
+from proto.run_locks import owned_run
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ROOT / "deploy" / "config" / "smoke.yaml"
@@ -94,7 +89,7 @@ def test_a_stopped_run_is_continued_to_its_end(tmp_path: Path) -> None:
     with started(tmp_path, "--set", "network.pfc.units=7") as process:
         output, errors = process.communicate(timeout=60)
         assert process.returncode == 2, output
-        assert "learner has ended and is not started again" in errors
+        assert "learner cannot work and is not started again" in errors
         assert not processes_that_name(str(tmp_path))
     assert load_config(run / "config.yaml") == config
     assert len(list(run.glob("policies/*.safetensors"))) == 4
@@ -170,28 +165,103 @@ def test_threads_and_actors_follow_the_config() -> None:
     assert "actor" not in {p.name for p in programs(config, Path("config.yaml"), 0)}
 
 
-def state(tmp_path: Path, **given: object) -> ProcessState:
-    values = {
-        "name": "actor-1", "state": "RUNNING", "pid": 7, "started_s": 100, "exit_status": 0,
-        "log": tmp_path / "actor-1.log",
-    } | given  # fmt: skip
-    return ProcessState(**values)  # type: ignore[arg-type]
+def test_a_run_that_is_being_played_is_not_touched_by_a_second_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def files() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    settings = [f"run.folder={tmp_path}", "run.name=mine", f"hub.endpoint={free_endpoint()}"]
+    words = [word for setting in settings for word in ("--set", setting)]
+    with owned_run(tmp_path / "mine"):
+        (tmp_path / "mine" / "logs").mkdir()
+        (tmp_path / "mine" / "logs" / "config.yaml").write_text("of the first start")
+        before = files()
+        assert main(words) == 2
+        assert "is being played already" in capsys.readouterr().err
+        assert files() == before
 
 
-def test_rare_crashes_are_reported_and_do_not_end_the_run(tmp_path: Path) -> None:
-    crashes = Crashes()
-    assert crashes.update([state(tmp_path, started_s=0)]) == []
-    for hour in range(1, 3 * TOO_MANY_CRASHES):
-        back = crashes.update([state(tmp_path, started_s=3600 * hour)])
-        assert bool(back) == (hour > 1), "the first start is no crash"
-        assert crashes.update([state(tmp_path, started_s=3600 * hour)]) == []
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (("done.policy_versions=99",), "done.policy_versions: 99 can never be reached"),
+        (("learner.epochs=10",), "gives 4 policy versions"),
+        ((f"run.name={'n' * 300}",), "at most 100 characters"),
+    ],
+)
+def test_what_can_never_work_starts_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], settings: tuple[str, ...], said: str
+) -> None:
+    words = [word for setting in settings for word in ("--set", setting)]
+    assert main(["--set", f"run.folder={tmp_path}", *words]) == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
-def test_repeated_crashes_end_the_run(tmp_path: Path) -> None:
-    (tmp_path / "actor-1.log").write_text("one\nno such luck\n")
-    crashes = Crashes()
-    for second in range(TOO_MANY_CRASHES):
-        crashes.update([state(tmp_path, started_s=100 + second)])
-    with pytest.raises(ProcessFailedError, match="no such luck") as failure:
-        crashes.update([state(tmp_path, started_s=100 + TOO_MANY_CRASHES)])
-    assert failure.value.exit_status == 1
+def test_a_run_goes_on_when_the_reader_of_its_output_ends() -> None:
+    script = (
+        "import sys\n"
+        "from deploy.run_local import RunConsole\n"
+        "sys.stdin.readline()\n"
+        "console = RunConsole()\n"
+        "for _ in range(3): console.print('nobody reads this')\n"
+        "print('went on', file=sys.stderr)\n"
+    )
+    with subprocess.Popen(
+        (sys.executable, "-c", script),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=ROOT,
+        text=True,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        process.stdin.write("the reader has ended\n")
+        process.stdin.close()
+        assert process.stderr.read() == "went on\n"
+
+
+def pid_of(role: str, folder: Path) -> int:
+    """Process id of a process of the smoke run in a folder; 0 if there is none."""
+    words = [role, "--config", str(folder / "smoke" / "logs" / "config.yaml")]
+    for process in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            if process.read_bytes().decode(errors="replace").split("\0")[2:-1] == words:
+                return int(process.parent.name)
+    return 0
+
+
+def wait_for_another(role: str, folder: Path, than: int) -> None:
+    eventually(lambda: pid_of(role, folder) not in (0, than), f"another {role} runs")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> None:
+    run = tmp_path / "smoke"
+    with started(tmp_path) as process:
+        eventually(lambda: bool(pid_of("actor", tmp_path)), "an actor runs")
+        eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept")
+        hub, actor = pid_of("hub", tmp_path), pid_of("actor", tmp_path)
+        os.kill(hub, signal.SIGSTOP)
+        os.kill(actor, signal.SIGKILL)
+        log = run / "logs" / "actor.log"
+        eventually(lambda: "no hub answers" in log.read_text(), "the next actor waits for the hub")
+        os.kill(hub, signal.SIGCONT)
+        for role in ("evaluator", "recorder", "learner"):
+            before = pid_of(role, tmp_path)
+            os.kill(before, signal.SIGTERM)
+            wait_for_another(role, tmp_path, before)
+        output, errors = process.communicate(timeout=300)
+        assert process.returncode == 0, errors
+    assert "actor was killed and is started again" in output
+    assert "evaluator ended (0) and is started again" in output
+    assert "policy 4, 10 of 10 trials counted" in output
+    assert not processes_that_name(str(tmp_path))
+    counted = (run / "evaluation" / "trials.jsonl").read_text().splitlines()
+    recorded = {path.stem for path in (run / "rollouts").glob("*.mcap")}
+    assert {json.loads(line)["episode"] for line in counted} <= recorded

@@ -1,17 +1,28 @@
-"""Crashed processes are started again, ended ones are reported, none outlives its supervisor."""
+"""Processes that end or are stuck are started again, and none outlives its supervisor."""
 
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 from processes import eventually
 
-from deploy.supervision import ProcessState, Program, Supervisor
+from deploy.supervision import (
+    FIRST_BEAT_WITHIN_S,
+    STUCK_AFTER_S,
+    ProcessFailedError,
+    ProcessState,
+    Program,
+    Supervisor,
+    SupervisorEndedError,
+    Watchdog,
+)
 from proto.errors import UserError
 
 SLEEP = (sys.executable, "-c", "import time; time.sleep(600)")
@@ -40,23 +51,125 @@ def test_all_programs_run_under_their_names_and_end_with_the_supervisor(tmp_path
     assert not any(is_alive(process.pid) for process in found.values())
 
 
-def test_a_killed_process_is_started_again(tmp_path: Path) -> None:
+class Watch:
+    """A watchdog over one program, with a clock that is set by hand."""
+
+    def __init__(self, supervisor: Supervisor) -> None:
+        self.told: list[str] = []
+        self.now_s = 1000.0
+        self._supervisor = supervisor
+        self._watchdog = Watchdog(supervisor, self.told.append, clock=lambda: self.now_s)
+        supervisor.start(supervisor.programs[0].name)
+
+    @property
+    def pid(self) -> int:
+        return self._supervisor.processes()[0].pid
+
+    def look(self, seconds: float) -> None:
+        """Look once a second for so many seconds of the clock."""
+        for _ in range(round(seconds)):
+            self.now_s += 1.0
+            self._watchdog.look()
+
+    def wait_for_another(self, than: int) -> None:
+        def another() -> bool:
+            self.look(1)
+            return self.pid not in (0, than)
+
+        eventually(another, "another process runs")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_process_that_was_killed_is_started_again(tmp_path: Path, number: int) -> None:
     with Supervisor([Program("actor", SLEEP)], tmp_path) as supervisor:
-        supervisor.start("actor")
-        eventually(lambda: states(supervisor)["actor"].state == "RUNNING", "the first process runs")
-        first = states(supervisor)["actor"].pid
-        os.kill(first, signal.SIGKILL)
-        eventually(
-            lambda: states(supervisor)["actor"].pid not in (0, first), "another process runs"
-        )
+        watch = Watch(supervisor)
+        watch.look(1)
+        first = watch.pid
+        os.kill(first, number)
+        watch.wait_for_another(first)
+    assert watch.told == [
+        f"actor was killed and is started again now; see {tmp_path / 'actor.log'}"
+    ]
 
 
-def test_a_process_that_ends_with_bad_input_is_not_started_again(tmp_path: Path) -> None:
+def test_a_process_that_always_ends_is_started_again_ever_later(tmp_path: Path) -> None:
+    ends = (sys.executable, "-c", "print('started')")
+    with Supervisor([Program("evaluator", ends)], tmp_path) as supervisor:
+        watch = Watch(supervisor)
+        log = tmp_path / "evaluator.log"
+
+        def starts() -> int:
+            watch.look(1)
+            return log.read_text().count("started") if log.exists() else 0
+
+        eventually(lambda: starts() >= 5, "five starts")
+    delays = [re.findall(r"again (?:in (\d+) s|now)", line)[0] for line in watch.told]
+    assert delays[:4] == ["", "2", "4", "8"]
+    assert "evaluator ended (0)" in watch.told[0]
+
+
+def test_a_frozen_process_is_killed_and_started_again(tmp_path: Path) -> None:
+    with Supervisor([Program("actor", SLEEP)], tmp_path) as supervisor:
+        watch = Watch(supervisor)
+        watch.look(1)
+        frozen = watch.pid
+        heartbeat = supervisor.heartbeat_file("actor")
+        watch.look(FIRST_BEAT_WITHIN_S - 2)
+        os.utime(heartbeat)
+        watch.look(1)
+        os.kill(frozen, signal.SIGSTOP)
+        watch.look(STUCK_AFTER_S)
+        os.utime(heartbeat)
+        watch.look(STUCK_AFTER_S)
+        assert watch.told == [], "it gave a sign of life in between"
+        watch.now_s += 1000.0  # whoever was frozen itself does not blame the others
+        watch.look(1)
+        assert watch.told == []
+        watch.look(STUCK_AFTER_S)
+        assert "actor is stuck: no sign of life for 60 s" in watch.told[0]
+        watch.wait_for_another(frozen)
+
+
+def test_a_process_with_bad_input_is_not_started_again(tmp_path: Path) -> None:
     command = (sys.executable, "-c", "import sys; print('no such thing'); sys.exit(2)")
     with Supervisor([Program("learner", command)], tmp_path) as supervisor:
-        supervisor.start("learner")
-        eventually(lambda: states(supervisor)["learner"].gave_up, "supervisord gives up")
-        assert "no such thing" in states(supervisor)["learner"].log.read_text()
+        watch = Watch(supervisor)
+        eventually(lambda: states(supervisor)["learner"].cannot_work, "it has ended")
+        with pytest.raises(ProcessFailedError, match="no such thing"):
+            watch.look(1)
+
+
+def test_when_supervisord_is_killed_even_frozen_processes_end(tmp_path: Path) -> None:
+    with Supervisor([Program("actor", SLEEP)], tmp_path) as supervisor:
+        watch = Watch(supervisor)
+        watch.look(1)
+        frozen = watch.pid
+        os.kill(frozen, signal.SIGSTOP)
+        parent = Path(f"/proc/{frozen}/stat").read_text().rpartition(")")[2].split()[1]
+        os.kill(int(parent), signal.SIGKILL)
+
+        def has_ended() -> bool:
+            try:
+                supervisor.processes()
+            except SupervisorEndedError:
+                return True
+            except OSError:
+                return False
+            return False
+
+        eventually(has_ended, "its end is noticed")
+    eventually(lambda: not is_alive(frozen), "the frozen process is gone")
+
+
+def test_a_long_folder_for_temporary_files_is_no_problem(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / ("t" * 110)
+    place.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(place))
+    with Supervisor([Program("actor", SLEEP)], tmp_path) as supervisor:
+        supervisor.start("actor")
+        assert states(supervisor)["actor"].state in {"STARTING", "RUNNING"}
 
 
 def test_each_program_gets_its_own_thread_count(tmp_path: Path) -> None:

@@ -89,7 +89,7 @@ class LearnerSetup:
         keys = self.actor.keys
         self.actor.subscribe_newest(keys.policy, self.policies.append, PolicyVersion)
         self.actor.subscribe(keys.metrics(Role.LEARNER), self._listen, LearnerMetrics)
-        self.actor.subscribe(keys.receipt("actor"), self._receipts.append, Receipt)
+        self.actor.subscribe(keys.receipt(Role.LEARNER, "actor"), self._receipts.append, Receipt)
         self.process: Popen[bytes]
 
     def start(self, *more: str) -> None:
@@ -492,3 +492,33 @@ def test_a_wrong_case_is_refused_at_the_start(setup: LearnerSetup) -> None:
     ended = run_vmdnn("learner", *setup.words, "--set", "learner.cases=[45]")
     assert ended.returncode == 2
     assert "learner.cases: there is no case 45" in ended.stderr
+
+
+def test_damaged_checkpoint_policy_and_run_id_lose_no_version(setup: LearnerSetup) -> None:
+    setup.start()
+    setup.show_all()
+    eventually(lambda: len(setup.policies) >= 3, "three policies")
+    setup.process.kill()
+    setup.process.wait()
+    policies = setup.folder / "policies"
+    published = {path: path.read_bytes() for path in policies.iterdir()}
+    newest = max(published)
+    run_id = setup.policies[-1].run_id
+    del published[newest]
+    newest.write_bytes(b"damaged")
+    training = training_file(setup.folder)
+    training.write_bytes(b"damaged")
+    training.with_name("run_id").write_bytes(b"")
+    half = training.with_name("training.safetensors.0123abcd.part")
+    half.touch()
+
+    setup.policies.clear()
+    setup.start()
+    eventually(lambda: len(setup.policies) >= 2, "policies after the restart")
+    first, second = (policy.version for policy in setup.policies[:2])
+    assert first < int(newest.stem) < second
+    assert setup.policies[0].run_id != run_id, "the id of the training is lost"
+    assert setup.wait_for_metrics(lambda metrics: metrics.damaged == 1).policy_version >= second
+    assert newest.with_suffix(".damaged").read_bytes() == b"damaged"
+    assert not half.exists()
+    assert {path: path.read_bytes() for path in published} == published

@@ -83,11 +83,11 @@ def matched(bus: Bus, key: str) -> None:
 
 def test_messages_arrive_in_order_complete_and_once(shared: Network) -> None:
     sender, reader = shared.join(Role.LEARNER, "l"), shared.join(Role.ACTOR, "in-order")
-    inbox = reader.inbox(KEYS.receipt("in-order"), Receipt, capacity=200)
-    matched(sender, KEYS.receipt("in-order"))
+    inbox = reader.inbox(KEYS.receipt(Role.LEARNER, "in-order"), Receipt, capacity=200)
+    matched(sender, KEYS.receipt(Role.LEARNER, "in-order"))
     sent = [Receipt(f"episode-{number}") for number in range(100)]
     for receipt in sent:
-        sender.deliver(KEYS.receipt("in-order"), receipt)
+        sender.deliver(KEYS.receipt(Role.LEARNER, "in-order"), receipt)
     assert [inbox.take(timeout_s=10.0) for _ in sent] == sent
     assert inbox.take(timeout_s=0.1) is None
 
@@ -105,10 +105,10 @@ def test_a_key_is_watched_as_long_as_someone_subscribes(shared: Network) -> None
 
 def test_a_full_inbox_drops_the_oldest_and_says_so(shared: Network) -> None:
     sender, reader = shared.join(Role.LEARNER, "l2"), shared.join(Role.ACTOR, "full")
-    inbox = reader.inbox(KEYS.receipt("full"), Receipt, capacity=3)
-    matched(sender, KEYS.receipt("full"))
+    inbox = reader.inbox(KEYS.receipt(Role.LEARNER, "full"), Receipt, capacity=3)
+    matched(sender, KEYS.receipt(Role.LEARNER, "full"))
     for number in range(10):
-        sender.deliver(KEYS.receipt("full"), Receipt(f"episode-{number}"))
+        sender.deliver(KEYS.receipt(Role.LEARNER, "full"), Receipt(f"episode-{number}"))
     eventually(lambda: inbox.dropped == 7, "seven dropped")
     assert inbox.take() == Receipt("episode-7")
 
@@ -116,7 +116,7 @@ def test_a_full_inbox_drops_the_oldest_and_says_so(shared: Network) -> None:
 def test_an_invalid_message_is_counted_and_logged_once_and_dropped(
     shared: Network, caplog: pytest.LogCaptureFixture
 ) -> None:
-    key = KEYS.receipt("guarded")
+    key = KEYS.receipt(Role.LEARNER, "guarded")
     reader, sender = shared.join(Role.ACTOR, "guarded"), shared.join(Role.LEARNER, "honest")
     stranger = shared.stranger()
     received: list[Receipt] = []
@@ -142,7 +142,7 @@ def test_an_invalid_message_is_counted_and_logged_once_and_dropped(
 
 
 def test_a_corrupted_payload_is_refused(shared: Network) -> None:
-    key = KEYS.receipt("digest")
+    key = KEYS.receipt(Role.LEARNER, "digest")
     reader, stranger = shared.join(Role.ACTOR, "digest"), shared.stranger()
     inbox = reader.inbox(key, Receipt, capacity=5)
     matched(shared.join(Role.LEARNER, "digest"), key)
@@ -161,10 +161,10 @@ def test_a_callback_that_fails_does_not_end_the_subscription(shared: Network) ->
         if len(received) == 1:
             raise RuntimeError("on purpose")
 
-    reader.subscribe(KEYS.receipt("failing"), fail_at_first, Receipt)
-    matched(sender, KEYS.receipt("failing"))
+    reader.subscribe(KEYS.receipt(Role.LEARNER, "failing"), fail_at_first, Receipt)
+    matched(sender, KEYS.receipt(Role.LEARNER, "failing"))
     for name in ("first", "second"):
-        sender.deliver(KEYS.receipt("failing"), Receipt(name))
+        sender.deliver(KEYS.receipt(Role.LEARNER, "failing"), Receipt(name))
     eventually(lambda: len(received) == 2, "the second message")
 
 

@@ -276,6 +276,7 @@ def test_metrics_are_plain_json() -> None:
         refused=0,
         policies=(PolicyScore(2, 4, rate, rate, rate, {"not_lifted": 1}),),
         leases=1,
+        damaged=0,
         paused=False,
         done=False,
     )

@@ -73,8 +73,24 @@ def test_a_second_process_of_a_role_in_a_run_is_refused() -> None:
         open_bus(config, "other", Role.LEARNER, "third") as third,
     ):
         alone_in_run(first, Lifecycle())
-        first.announce()
-        eventually(lambda: second.present(Role.LEARNER) == {"first"}, "the first is present")
-        alone_in_run(third, Lifecycle())
-        with pytest.raises(UserError, match=r"run test has a learner already \(first\)"):
-            alone_in_run(second, Lifecycle(), patience_s=0.5)
+        with membership(first, IdleProcess(first), Lifecycle()):
+            eventually(lambda: second.present(Role.LEARNER) == {"first"}, "the first is present")
+            alone_in_run(third, Lifecycle())
+            with pytest.raises(UserError, match=r"run test has a learner already \(first\)"):
+                alone_in_run(second, Lifecycle(), patience_s=3.0)
+
+
+def test_a_token_without_a_living_process_keeps_nobody_out(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    endpoint = free_endpoint()
+    config = HubConfig(endpoint=endpoint)
+    with (
+        listening_hub(endpoint),
+        open_bus(config, "test", Role.LEARNER, "silent") as stranger,
+        open_bus(config, "test", Role.LEARNER, "mine") as mine,
+    ):
+        stranger.announce()
+        eventually(lambda: mine.present(Role.LEARNER) == {"silent"}, "it is present")
+        alone_in_run(mine, Lifecycle(), patience_s=0.5)
+    assert "ignores silent, which is present but silent" in caplog.text

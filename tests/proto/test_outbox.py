@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from proto.codec import Wire
+from proto.keys import Role
 from proto.outbox import IN_FLIGHT, RESEND_AFTER_AT_MOST_S, Outbox
 
 AFTER_S = 5.0
@@ -200,3 +201,36 @@ def test_a_damaged_file_is_put_aside(
     assert (len(outbox), outbox.put_aside) == (1, 2)
     assert suffixes(tmp_path) == [".damaged", ".damaged", ".message"]
     assert "is damaged" in caplog.text
+
+
+def test_a_message_leaves_when_all_its_receivers_have_it(
+    outbox: Outbox, link: Link, clock: Clock, tmp_path: Path
+) -> None:
+    both = [Role.EVALUATOR, Role.RECORDER]
+    outbox.add("a", "key", wire("a"), both)
+    outbox.received("a", Role.EVALUATOR)
+    outbox.received("a", Role.EVALUATOR)
+    outbox.received("a", Role.LEARNER)
+    assert outbox.missing == {Role.RECORDER}
+    clock.now_s += AFTER_S
+    outbox.send_due()
+    assert link.take() == ["a", "a"]
+
+    # The next process does not know who has it already, and asks both again.
+    again = Outbox(tmp_path, link, clock=clock)
+    again.send_due()
+    assert again.missing == set(both)
+    again.received("a", Role.RECORDER)
+    assert len(again) == 1
+    again.received("a", Role.EVALUATOR)
+    assert len(again) == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_message_of_an_older_version_needs_one_receipt(tmp_path: Path, link: Link) -> None:
+    old = b'{"key": "key", "encoding": "application/msgpack;vmdnn.test.1"}\nold'
+    (tmp_path / "1-a.message").write_bytes(old)
+    outbox = Outbox(tmp_path, link)
+    outbox.send_due()
+    outbox.received("a", Role.EVALUATOR)
+    assert len(outbox) == 0

@@ -88,7 +88,7 @@ def test_every_key_is_documented() -> None:
         keys.sequence("<actor>"),
         keys.rollout("<actor>"),
         keys.failure("<actor>"),
-        keys.receipt("<actor>"),
+        keys.receipt("<role>", "<actor>"),
         keys.verdict,
         keys.request_tutoring,
         keys.request_trial,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import subprocess
 import sys
 from pathlib import Path
@@ -72,3 +74,14 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         own_id(tmp_path / "file", Role.ACTOR, None),
     ):
         pass
+
+
+def test_a_file_system_without_locks_is_told_and_stops_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with only_one(tmp_path, Role.LEARNER, "learner"):
+        assert "cannot be locked (Function not implemented)" in caplog.text

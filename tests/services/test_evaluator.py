@@ -135,7 +135,7 @@ class EvaluatorSetup:
 
     def _answer(self, actor: Bus, name: str, key: str, message: object) -> str:
         receipts: list[Receipt] = []
-        actor.subscribe(actor.keys.receipt(actor.id), receipts.append, Receipt)
+        actor.subscribe(actor.keys.receipt(Role.EVALUATOR, actor.id), receipts.append, Receipt)
 
         def answers() -> list[Receipt]:
             return [receipt for receipt in list(receipts) if receipt.episode == name]
@@ -284,7 +284,7 @@ def test_a_killed_evaluator_keeps_its_counts(setup: EvaluatorSetup) -> None:
     assert stop(setup.process) == 0
 
 
-def test_a_trial_whose_simulation_fails_is_a_failure_and_is_not_played_again(
+def test_a_trial_whose_simulation_fails_three_times_is_a_failure(
     setup: EvaluatorSetup, failure: Callable[..., EpisodeFailed]
 ) -> None:
     actor = setup.join(Role.ACTOR, "a")
@@ -292,8 +292,10 @@ def test_a_trial_whose_simulation_fails_is_a_failure_and_is_not_played_again(
     assert setup.ask_until_given(actor, 1) == 70
     trial = {"actor": "a", "kind": Kind.TRIAL, "training": "training", "policy_version": 1}
     trial["situation"] = dict(TASK.sample(70))
-    assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
-    assert setup.fail(actor, failure("failed", seed=70, **trial)) == ""
+    for name in ("first", "first", "second"):
+        assert setup.fail(actor, failure(name, seed=70, **trial)) == ""
+        assert setup.ask(actor, 1) == [70], "it is tried again"
+    assert setup.fail(actor, failure("third", seed=70, **trial)) == ""
     assert "seed 99" in setup.fail(actor, failure("nobody-asked", seed=99, **trial))
     metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 1})
     assert metrics.policies[0].reasons == {"simulation_failed": 1}
@@ -346,11 +348,3 @@ def test_a_second_evaluator_of_the_same_folder_is_refused(setup: EvaluatorSetup)
     second = run_vmdnn("evaluator", *setup.words, "--id", "second")
     assert second.returncode == 2
     assert "already works in" in second.stderr
-
-
-def test_without_a_hub_it_prints_what_to_do(tmp_path: Path) -> None:
-    words = ("--connect", free_endpoint(), "--set", f"run.folder={tmp_path}")
-    ended = run_vmdnn("evaluator", *words)
-    assert ended.returncode == 2
-    assert "start one with `vmdnn hub`" in ended.stderr
-    assert "Traceback" not in ended.stderr

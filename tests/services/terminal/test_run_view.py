@@ -78,3 +78,9 @@ def test_problems_are_shown() -> None:
     assert "2, 3 put aside" in shown(view)
     assert "2 given up" in run_line(view)
     assert "put aside" not in shown(view_of(ACTOR))
+
+
+def test_what_processes_wait_for_is_shown() -> None:
+    view = view_of(replace(ACTOR, waiting_for="the [hub]"), LEARNER)
+    assert "actor a-1 waits for the [hub]" in shown(view)
+    assert "learner l waits" not in shown(view)

@@ -70,6 +70,7 @@ def test_a_damaged_line_is_skipped_and_reported(
     path.write_bytes(lines[0] + lines[1].replace(b'"strict"', b'"strikt"') + lines[2])
     assert sorted(TrialLog(path).outcomes("run", 1)) == [1, 3]
     assert "line 2 is not counted: outcome" in caplog.text
+    assert TrialLog(path).damaged == 1
 
 
 def test_lines_of_format_1_can_be_read(tmp_path: Path) -> None:
