@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fitting import settings_digest
 from ports import free_endpoint
 from processes import eventually, stop, vmdnn
 
@@ -77,6 +78,8 @@ def rollout(make_episode: MakeEpisode) -> Callable[..., Rollout]:
         episode = make_episode(
             20,
             id=name,
+            actor="actor",
+            config_digest=settings_digest(),
             kind=Kind.PRACTICE if trial is None else Kind.TRIAL,
             outputs=np.full((20, 110), 0.1, dtype=np.float32),
         )
@@ -95,7 +98,7 @@ def test_every_rollout_is_kept_once(
     with open_bus(hub, RUN, Role.ACTOR, "actor") as bus, recorder(hub, tmp_path) as process:
         listener = Listener(bus)
         receipts: list[Receipt] = []
-        bus.subscribe(bus.keys.receipt(Role.RECORDER, "local"), receipts.append, Receipt)
+        bus.subscribe(bus.keys.receipt(Role.RECORDER, "actor"), receipts.append, Receipt)
         listener.wait_for(lambda metrics: metrics.episodes == 0)
         sent = [rollout(f"rollout{number}", number or None) for number in range(5)]
         for message in [*sent, *sent[:2]]:
