@@ -11,12 +11,13 @@ from typing import Final
 
 import numpy as np
 
+from actors.disturbances.staging import check_abilities, situation_of, stage
 from actors.player import LiveStep, play
 from actors.policies.by_name import check_task
 from actors.policies.contract import Policy
 from actors.policies.guided import GuidedPolicy
 from actors.policies.planned import make_tutor
-from actors.simulator import make_simulator
+from actors.simulator import make_simulator, player_of
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from learner.checkpoint import checkpoint_from_bytes
@@ -45,7 +46,7 @@ from proto.metrics import ActorMetrics
 from proto.outbox import Outbox
 from proto.pace import Pace
 from proto.periodic import every
-from proto.seeds import PRACTICE
+from proto.suites import Conditions
 from proto.variables import Situation
 
 LOG = logging.getLogger(__name__)
@@ -70,6 +71,7 @@ class Assignment:
         situation: the situation.
         seed: seed of the episode.
         training: id of the training that the policy comes from, empty for the tutor.
+        conditions: conditions of the suite that it belongs to.
     """
 
     kind: Kind
@@ -78,6 +80,7 @@ class Assignment:
     situation: Situation
     seed: int
     training: str = ""
+    conditions: Conditions | None = None
 
 
 def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
@@ -110,8 +113,16 @@ class Actor:
     means nothing to another.
     """
 
-    def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
+    def __init__(
+        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, backend: str | None = None
+    ) -> None:
         """Make the simulator, and find the messages that a former process with this id left.
+
+        Args:
+            config: the configuration of the run.
+            bus: connection to the other processes.
+            lifecycle: says when to pause and to stop.
+            backend: name of this actor's simulator; None for `simulator.backend`.
 
         Raises:
             UserError: the simulator cannot run on this machine, or the run's folder cannot be
@@ -125,7 +136,9 @@ class Actor:
         self._tasks = {self._task.name: self._task}
         if (first := config.pretraining_task) is not None:
             self._tasks[first] = make_task(config.task_called(first))
-        self._simulator = make_simulator(config.simulator)
+        chosen = {} if backend is None else {"backend": backend}
+        self._simulator = make_simulator(config.simulator.model_copy(update=chosen))
+        self._player = player_of(self._simulator)
         outbox = config.run_folder / "outbox" / bus.id
         self._sequences = Outbox(outbox / "sequences", bus.deliver_wire)
         self._rollouts = Outbox(outbox / "rollouts", bus.deliver_wire)
@@ -210,7 +223,7 @@ class Actor:
         if len(self._sequences) >= OUTBOX_LIMIT:
             return None
         version = self._policy.version if self._policy else 0
-        request = TutoringRequest(self._bus.id, self._policy_run, version)
+        request = TutoringRequest(self._bus.id, self._policy_run, version, self._player)
         key = self._bus.keys.request_tutoring
         answers: list[TutoringCase | Correction]
         answers = self._bus.ask(key, request, TutoringCase, Correction)
@@ -243,13 +256,19 @@ class Actor:
             UserError: there is no policy, or the situation is not one of the task.
         """
         task = self._task_called(asked.task)
-        task.check(asked.situation)
+        self._check(task, asked.situation, asked.conditions, asked.seed)
         if self._policy is None:
             raise UserError("there is no policy to be guided")
         tutor = make_tutor(task)
         guided = GuidedPolicy(self._policy, tutor, self._config.tutor.guidance_deg)
         return Assignment(
-            Kind.CORRECTION, task, guided, asked.situation, asked.seed, self._policy_run
+            Kind.CORRECTION,
+            task,
+            guided,
+            asked.situation,
+            asked.seed,
+            self._policy_run,
+            asked.conditions,
         )
 
     def _task_called(self, name: str) -> Task:
@@ -261,25 +280,61 @@ class Actor:
         """A trial of this policy that the evaluator asks for; None if there is none."""
         if self._policy is None or len(self._rollouts) >= OUTBOX_LIMIT:
             return None
-        request = TrialRequest(self._bus.id, self._policy_run, self._policy.version)
+        request = TrialRequest(self._bus.id, self._policy_run, self._policy.version, self._player)
         for trial in self._bus.ask(self._bus.keys.request_trial, request, Trial):
-            situation = self._task.sample(trial.seed)
-            return Assignment(
-                Kind.TRIAL, self._task, self._policy, situation, trial.seed, self._policy_run
-            )
+            try:
+                return self._rollout(Kind.TRIAL, self._policy, trial.seed, trial.conditions)
+            except UserError as error:
+                LOG.warning("the evaluator's trial cannot be played: %s", error)
         return None
 
     def _practice(self) -> Assignment | None:
-        """A random situation; None without a policy, or if practice is off or ahead of receipts."""
+        """A random situation of a suite that is practised, and that this actor can play.
+
+        None without a policy, without such a suite, or if practice is off or ahead of receipts.
+        """
         if self._policy is None or not self._config.actor.practice:
             return None
         if len(self._rollouts) >= PRACTICE_LIMIT:
             return None
-        seed = secrets.choice(PRACTICE)
-        situation = self._task.sample(seed)
-        return Assignment(
-            Kind.PRACTICE, self._task, self._policy, situation, seed, self._policy_run
-        )
+        drawn = [
+            (seed, suite.conditions(seed))
+            for suite in self._config.practised_suites()
+            for seed in (secrets.choice(suite.practice_seeds),)
+            if self._player.can_play(suite.backend, suite.conditions(seed))
+        ]
+        if not drawn:
+            return None
+        seed, conditions = secrets.choice(drawn)
+        try:
+            return self._rollout(Kind.PRACTICE, self._policy, seed, conditions)
+        except UserError as error:
+            LOG.warning("a situation cannot be practised: %s", error)
+            return None
+
+    def _rollout(
+        self, kind: Kind, policy: Policy, seed: int, conditions: Conditions | None
+    ) -> Assignment:
+        """An episode of the policy in the situation of a seed.
+
+        Raises:
+            UserError: the task cannot be played under these conditions.
+        """
+        situation = situation_of(self._task, conditions, seed)
+        self._check(self._task, situation, conditions, seed)
+        return Assignment(kind, self._task, policy, situation, seed, self._policy_run, conditions)
+
+    def _check(
+        self, task: Task, situation: Situation, conditions: Conditions | None, seed: int
+    ) -> None:
+        """Check that an episode can be played.
+
+        Raises:
+            UserError: the situation is not one of the task, or task or simulator cannot be
+                disturbed as the conditions say.
+        """
+        check_abilities(self._simulator, conditions)
+        stage(task, situation, conditions, seed)
 
     def _play(self, assignment: Assignment) -> Episode:
         live_key = self._bus.keys.live(self._bus.id)
@@ -303,6 +358,7 @@ class Actor:
                 actor=self._bus.id,
                 config_digest=self._digest,
                 on_step=on_step,
+                conditions=assignment.conditions,
             )
         except (ArithmeticError, ValueError, RuntimeError) as error:
             if self._simulation_is_finite():
@@ -350,6 +406,7 @@ class Actor:
             training=failed.training,
             policy_version=failed.policy.version,
             problem=ascii(problem)[1:-1][:1000],
+            conditions=failed.conditions,
         )
         outbox = self._rollouts if failed.kind is Kind.TRIAL else self._sequences
         outbox.add(report.id, self._bus.keys.failure(self._bus.id), encode(report))

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import time
 from collections import defaultdict, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -20,7 +21,7 @@ from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
-from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
+from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore, SuiteScore
 from services.arguments.common import config_argument, integer
 from services.board import Board, RunView
 from services.machine.ports import port_trouble
@@ -61,7 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.backend is not None:
             overrides.append(f"simulator.backend={arguments.backend}")
         config = load_config(arguments.config, overrides)
-        actors = default_actors() if arguments.actors is None else arguments.actors
+        actors = actors_of(arguments.actors, config)
+        check_actors(actors, config)
         if trouble := port_trouble(config.hub.endpoint):
             raise UserError(trouble)
         run(config, actors, Console())
@@ -74,17 +76,58 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def default_actors() -> int:
-    """Return one actor for each core; they use the processor time that the learner leaves."""
-    return len(os.sched_getaffinity(0))
+def actors_of(given: Mapping[str, int] | int | None, config: Config) -> Mapping[str, int]:
+    """Return the number of actors by simulator.
+
+    Args:
+        given: numbers by simulator; a number of actors with `simulator.backend`; or None for one
+            actor for each core, which uses the processor time that the learner leaves.
+        config: the configuration.
+    """
+    if isinstance(given, Mapping):
+        return given
+    number = len(os.sched_getaffinity(0)) if given is None else given
+    return {config.simulator.backend: number}
 
 
-def run(config: Config, actors: int, console: Console) -> None:
+def check_actors(actors: Mapping[str, int], config: Config) -> None:
+    """Check that there is an actor for every suite and for the tutor.
+
+    Without any actor here, all are expected to join from elsewhere; `NAME=0` says so of one
+    simulator.
+
+    Raises:
+        UserError: no actor has a simulator that the configuration names.
+    """
+    if not any(actors.values()):
+        return
+    wanted = [f"{backend}=1" for backend in _backends_of(config)]
+    advice = (
+        f"start one with --actors {','.join(wanted)}, or write 0 in place of 1 if such actors join"
+        " from elsewhere"
+    )
+    for suite in (*config.suites, *config.practised_suites()):
+        if suite.backend not in actors:
+            raise UserError(
+                f"no actor has the simulator {suite.backend} of the suite {suite.name}; {advice}"
+            )
+    if not set(config.tutoring_backends) & set(actors):
+        names = " or ".join(config.tutoring_backends)
+        raise UserError(f"no actor has the simulator {names} of tutor.backends; {advice}")
+
+
+def _backends_of(config: Config) -> list[str]:
+    """Return the names of all simulators that a run needs."""
+    suites = (suite.backend for suite in config.suites)
+    return list(dict.fromkeys([config.simulator.backend, *config.tutoring_backends, *suites]))
+
+
+def run(config: Config, actors: Mapping[str, int], console: Console) -> None:
     """Play a run until it is done or this process is to stop.
 
     Args:
         config: the configuration of the run.
-        actors: number of actors.
+        actors: number of actors by simulator.
         console: shows the state of the run.
 
     Raises:
@@ -99,9 +142,10 @@ def run(config: Config, actors: int, console: Console) -> None:
     # The learner writes config.yaml of the run, after it has checked that the run can continue.
     file = logs / "config.yaml"
     config.save(file)
+    number = sum(actors.values())
     console.print(
-        f"{'continuing' if exists else 'starting'} run {config.run.name} with {actors} "
-        f"{'actor' if actors == 1 else 'actors'} in {config.run_folder}",
+        f"{'continuing' if exists else 'starting'} run {config.run.name} with {number} "
+        f"{'actor' if number == 1 else 'actors'} in {config.run_folder}",
         highlight=False,
     )
     with Supervisor(programs(config, file, actors), logs) as supervisor:
@@ -115,8 +159,14 @@ def run(config: Config, actors: int, console: Console) -> None:
     console.print(text, highlight=False, soft_wrap=True)
 
 
-def programs(config: Config, file: Path, actors: int) -> list[Program]:
-    """Return the programs of a run, in the order in which they are started."""
+def programs(config: Config, file: Path, actors: Mapping[str, int]) -> list[Program]:
+    """Return the programs of a run, in the order in which they are started.
+
+    Args:
+        config: the configuration of the run.
+        file: its file.
+        actors: number of actors by simulator.
+    """
 
     def vmdnn(role: Role) -> tuple[str, ...]:
         return (VMDNN, role.value, "--config", str(file))
@@ -132,8 +182,11 @@ def programs(config: Config, file: Path, actors: int) -> list[Program]:
         Program("evaluator", vmdnn(Role.EVALUATOR)),
         Program("recorder", vmdnn(Role.RECORDER)),
     ]
-    if actors:
-        started.append(Program("actor", vmdnn(Role.ACTOR), processes=actors))
+    present = {backend: number for backend, number in actors.items() if number}
+    for backend, number in present.items():
+        chosen = () if backend == config.simulator.backend else ("--backend", backend)
+        name = "actor" if len(present) == 1 else f"actor-{re.sub('[^A-Za-z0-9]+', '-', backend)}"
+        started.append(Program(name, (*vmdnn(Role.ACTOR), *chosen), processes=number))
     return started
 
 
@@ -183,7 +236,7 @@ def summary(view: RunView, config: Config, wall_s: float) -> str:
     lines = [
         f"run {config.run.name}: {view.policy_version} policy versions"
         f" in {minutes} min {seconds} s",
-        *_score_lines(_newest_counted(view.scores, config), config),
+        *_suite_lines(view.suites),
         f"files: {config.run_folder}/ with config.yaml, tutoring, checkpoints, policies, "
         "rollouts, evaluation, logs",
     ]
@@ -218,16 +271,29 @@ def _connect(config: Config, supervisor: Supervisor, lifecycle: Lifecycle) -> Bu
                 raise
 
 
-def _newest_counted(scores: Sequence[PolicyScore], config: Config) -> PolicyScore | None:
+def _suite_lines(suites: Sequence[SuiteScore]) -> list[str]:
+    """Return the result of each suite in a few lines; with one suite, without its name."""
+    named = len(suites) > 1
+    lines = [
+        f"{suite.name}, {line}" if named and not line.startswith(" ") else line
+        for suite in suites
+        for line in _score_lines(suite)
+    ]
+    return lines or ["no trial was counted"]
+
+
+def _newest_counted(suite: SuiteScore) -> PolicyScore | None:
     """Return the score of the newest policy with all trials counted, or else with any counted."""
-    complete = [score for score in scores if score.trials >= config.evaluator.trials_per_policy]
+    scores = suite.policies
+    complete = [score for score in scores if score.trials >= suite.trials]
     return max(complete or scores, key=lambda score: score.version, default=None)
 
 
-def _score_lines(score: PolicyScore | None, config: Config) -> list[str]:
+def _score_lines(suite: SuiteScore) -> list[str]:
+    score = _newest_counted(suite)
     if score is None:
-        return ["no trial was counted"]
-    counted = f"{score.trials} of {config.evaluator.trials_per_policy} trials counted"
+        return ["no trial was counted" + (f": {suite.unplayable}" if suite.unplayable else "")]
+    counted = f"{score.trials} of {suite.trials} trials counted"
     return [
         f"policy {score.version}, {counted}; successes, rate and its 95 % interval:",
         *(
@@ -245,10 +311,26 @@ def _span(times_s: Sequence[int]) -> int:
     return times_s[-1] - times_s[0]
 
 
+def _actors(text: str) -> Mapping[str, int] | int:
+    """Parse a number of actors, or numbers by simulator such as `sapien=1,mujoco=1`."""
+    number = integer(0)
+    if "=" not in text:
+        return int(number(text))
+    actors: dict[str, int] = {}
+    for part in text.split(","):
+        backend, equals, count = part.strip().rpartition("=")
+        if not equals or not backend or backend in actors:
+            raise argparse.ArgumentTypeError(
+                f"{text!r}: write a number, or one for each simulator such as sapien=1,mujoco=1"
+            )
+        actors[backend] = number(count)
+    return actors
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="run_local", add_help=False)  # run_local.sh prints it
     parser.add_argument("--config", type=config_argument, default=DEFAULT_CONFIG)
-    parser.add_argument("--actors", type=integer(0))
+    parser.add_argument("--actors", type=_actors)
     parser.add_argument("--backend")
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     return parser

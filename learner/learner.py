@@ -41,6 +41,7 @@ from proto.messages import (
 )
 from proto.metrics import LearnerMetrics, Stage
 from proto.pace import Pace
+from proto.players import Players
 from proto.storage import written_whole
 
 LOG = logging.getLogger(__name__)
@@ -113,6 +114,8 @@ class Learner:
         self._training = threading.Lock()  # held while the trainer changes or is written to disk
         self._run_id = _run_id(self._folder)
         self._round = self._make_round()
+        self._players = Players()
+        self._unplayable = ""
         self._given_up = 0
         for store in self._stores.values():
             for summary in store.summaries():
@@ -137,6 +140,7 @@ class Learner:
                 may_train = self._may_train
                 self._receive(sequences, wait_s=0.0 if may_train else IDLE_S)
                 self._receive_failures(failures)
+                self._look_for_players()
                 if may_train:
                     self._train()
         LOG.info(self.checkpoint())
@@ -210,18 +214,35 @@ class Learner:
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
 
     def _hand_out(self, request: TutoringRequest) -> TutoringCase | Correction | None:
+        self._players.note(request.actor, request.player)
         if self._lifecycle.paused:
             return None
-        case, awaited = self._curriculum.next_case(request.actor), self._round
-        if case is not None or awaited is None:
-            return case
-        return awaited.next_correction(request)
+        awaited = self._round
+        if request.player.backend in self._config.tutoring_backends:
+            case = self._curriculum.next_case(request.actor)
+            if case is not None:
+                return case
+        return None if awaited is None else awaited.next_correction(request)
+
+    def _look_for_players(self) -> None:
+        """Log once if no present actor can play what is waited for."""
+        problem, awaited = "", self._round
+        backends = self._config.tutoring_backends
+        if self._curriculum.missing:
+            if self._players.lack(lambda player: player.backend in backends):
+                problem = f"cases are not shown: no actor has {' or '.join(backends)}"
+        elif awaited is not None and self._players.lack(awaited.is_played_by):
+            problem = f"round {awaited.number} waits: no actor can practise or correct in it"
+        if problem and problem != self._unplayable:
+            LOG.warning(problem)
+        self._unplayable = problem
 
     def _on_verdict(self, verdict: Verdict) -> None:
         if (awaited := self._round) is not None:
             awaited.judge(verdict)
 
     def _on_presence(self, actor: str, alive: bool) -> None:
+        self._players.presence(actor, alive)
         if alive:
             return
         self._curriculum.release(actor)

@@ -8,9 +8,20 @@ from typing import Annotated, Final
 
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.codec import MEBIBYTE, Array, Blob, Integer, Number, Text, message
-from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind, Outcome
+from proto.episode import (
+    JOINTS,
+    LARGEST_DEG,
+    ConditionsField,
+    Episode,
+    Floats,
+    Id,
+    Image,
+    Kind,
+    Outcome,
+)
 from proto.keys import Role
 from proto.seeds import SEEDS_PER_CASE
+from proto.suites import Player, suite_of
 from proto.variables import SituationField
 
 EPISODE_LIMIT: Final = 32 * MEBIBYTE
@@ -85,6 +96,7 @@ class EpisodeFailed:
         training: id of the training that the policy comes from, empty for the tutor.
         policy_version: version of the policy, 0 for the tutor.
         problem: why the simulation failed.
+        conditions: as in `Episode`.
     """
 
     id: Id
@@ -96,6 +108,12 @@ class EpisodeFailed:
     training: Annotated[str, Text(64)]
     policy_version: Count
     problem: Annotated[str, Text(1000)]
+    conditions: ConditionsField = None
+
+    @property
+    def suite(self) -> str:
+        """Name of the suite that the episode belongs to."""
+        return suite_of(self.conditions)
 
 
 @message("receipt", 2)
@@ -113,7 +131,7 @@ class Receipt:
     refusal: Annotated[str, Text(1000)] = ""
 
 
-@message("tutoring_request", 2)
+@message("tutoring_request", 3)
 @dataclass(frozen=True)
 class TutoringRequest:
     """An actor's request for a `TutoringCase` or a `Correction`.
@@ -122,11 +140,13 @@ class TutoringRequest:
         actor: id of the actor.
         run_id: id of the training that its policy comes from, empty if it has no policy.
         policy_version: version of its policy, 0 if it has none.
+        player: what it can play.
     """
 
     actor: Id
     run_id: Annotated[str, Text(64)]
     policy_version: Count
+    player: Player
 
 
 @message("tutoring_case", 2)
@@ -159,14 +179,16 @@ class Correction:
         task: name of the task.
         seed: seed of the episode.
         situation: the situation's values by name.
+        conditions: as in `Episode`.
     """
 
     task: Annotated[str, Text(64)]
     seed: Seed
     situation: SituationField
+    conditions: ConditionsField = None
 
 
-@message("verdict", 2)
+@message("verdict", 3)
 @dataclass(frozen=True)
 class Verdict:
     """Outcome of an episode of practice. The learner chooses corrections where the policy failed.
@@ -178,6 +200,8 @@ class Verdict:
         seed: seed of the episode.
         situation: the situation's values by name.
         outcome: how it ended.
+        backend: name of the simulator that played it.
+        conditions: as in `Episode`.
     """
 
     run_id: Id
@@ -186,9 +210,11 @@ class Verdict:
     seed: Seed
     situation: SituationField
     outcome: Outcome
+    backend: str
+    conditions: ConditionsField = None
 
 
-@message("trial_request", 1)
+@message("trial_request", 2)
 @dataclass(frozen=True)
 class TrialRequest:
     """An actor's request for a trial of its policy; fields as in `TutoringRequest`."""
@@ -196,6 +222,7 @@ class TrialRequest:
     actor: Id
     run_id: Id
     policy_version: Count
+    player: Player
 
 
 @message("trial", 1)
@@ -205,9 +232,11 @@ class Trial:
 
     Attributes:
         seed: seed of the situation and of the episode.
+        conditions: as in `Episode`.
     """
 
     seed: Seed
+    conditions: ConditionsField = None
 
 
 @message("live", 3)

@@ -13,6 +13,7 @@ from proto.episode import Kind
 from proto.leases import Leases
 from proto.messages import Correction, EpisodeFailed, PolicyKey, TutoringRequest, Verdict
 from proto.seeds import CORRECTIONS
+from proto.suites import UNLEARNED, Player, Suite, suite_of
 from proto.variables import Question, Situation
 
 
@@ -59,6 +60,9 @@ class Round:
         """
         corrections = config.learner.corrections
         self.number = number
+        self._suites = {suite.name: suite for suite in config.practised_suites()}
+        self._tested = tuple(suite.test_seeds for suite in config.suites)
+        self._backends = config.tutoring_backends
         self._task = config.task.name
         self._policy = policy
         self._tries = corrections.tries if corrections.choose == "failures" else 0
@@ -94,19 +98,34 @@ class Round:
             ours = (verdict.run_id, verdict.policy_version) == self._policy
             if not ours or verdict.task != self._task or not self._searching:
                 return
+            if not self._is_practice(verdict):
+                return
             self._judged.add(verdict.seed)
             done = self._kept | self._given_up
             if not verdict.outcome.precise and verdict.seed not in done:
-                plan = Correction(verdict.task, verdict.seed, verdict.situation)
-                self._missing[verdict.seed] = plan
+                self._missing[verdict.seed] = Correction(
+                    verdict.task, verdict.seed, verdict.situation, verdict.conditions
+                )
 
     def next_correction(self, request: TutoringRequest) -> Correction | None:
         """A situation for an actor; None if none is left, or if the actor has another policy."""
         if (request.run_id, request.policy_version) != self._policy:
             return None
         with self._lock:
-            seed = self._leases.take(request.actor, self._missing)
+            playable = (
+                seed for seed, plan in self._missing.items() if self._fits(plan, request.player)
+            )
+            seed = self._leases.take(request.actor, playable)
             return None if seed is None else self._missing[seed]
+
+    def is_played_by(self, player: Player) -> bool:
+        """Whether a player can help with what the round waits for: corrections, or practice."""
+        with self._lock:
+            if any(self._fits(plan, player) for plan in self._missing.values()):
+                return True
+            return self._searching and any(
+                suite.backend == player.backend for suite in self._suites.values()
+            )
 
     def release(self, actor: str) -> None:
         """Hand out again what an actor that vanished was playing."""
@@ -140,9 +159,30 @@ class Round:
             self._given_up.add(report.seed)
             return True
 
+    def _is_practice(self, verdict: Verdict) -> bool:
+        """Whether an episode was practice of a suite that is practised, never one of its trials."""
+        suite = self._suites.get(suite_of(verdict.conditions))
+        return (
+            suite is not None
+            and not self._is_tested(verdict.seed)
+            and _may_be_practised(suite, verdict)
+        )
+
+    def _is_tested(self, seed: int) -> bool:
+        """Whether a seed is one of a suite's trials; nothing is learned from their situations."""
+        return any(seed in tested for tested in self._tested)
+
+    def _fits(self, plan: Correction, player: Player) -> bool:
+        """Whether a player can play a correction, in the world in which the policy failed."""
+        if self._tries:
+            backend = self._suites[suite_of(plan.conditions)].backend
+            return player.can_play(backend, plan.conditions)
+        return player.backend in self._backends
+
     def _lacks(self, shown: Shown) -> bool:
         return (
             self._is_of_policy(shown)
+            and not (self._tries and self._is_tested(shown.seed))
             and shown.seed not in self._kept
             # a correction that was asked for before a restart is accepted as well
             and (shown.seed in self._missing or not self._full)
@@ -162,6 +202,16 @@ class Round:
     @property
     def _searching(self) -> bool:
         return len(self._judged) < self._tries and not self._full
+
+
+def _may_be_practised(suite: Suite, verdict: Verdict) -> bool:
+    """Whether simulator, seed and conditions of an episode are those of a suite's practice."""
+    if verdict.backend != suite.backend:
+        return False
+    if suite.name == UNLEARNED and verdict.conditions is None:
+        return True
+    in_range = verdict.seed in suite.practice_seeds
+    return in_range and verdict.conditions == suite.conditions(verdict.seed)
 
 
 def _chosen(config: Config, number: int, situations: Situations) -> list[Correction]:

@@ -23,7 +23,15 @@ from learner.training.trainer import Trainer
 from learner.training.vmdnn_recipe import VMDNNRecipe
 from learner.tutoring.store import TutoringStore
 from proto.bus import Bus, open_bus
-from proto.config import Config, HubConfig, LearnerConfig, PretrainingConfig, TaskConfig
+from proto.config import (
+    Config,
+    HubConfig,
+    LearnerConfig,
+    PretrainingConfig,
+    TaskConfig,
+    load_config,
+)
+from proto.disturbances import Ability
 from proto.episode import Episode, Kind
 from proto.keys import Role
 from proto.messages import (
@@ -45,9 +53,11 @@ from proto.messages import (
 from proto.metrics import ActorMetrics
 from proto.outbox import IN_FLIGHT
 from proto.seeds import PRACTICE
+from proto.suites import Conditions, Player
 
 MakeEpisode = Callable[..., Episode]
 TASK = make_task(TaskConfig())
+SAPIEN = Player("sapien", tuple(sorted(Ability)))
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +231,9 @@ def test_its_policy_is_guided_in_situations_that_the_learner_requests(
     assert {(r.run_id, r.policy_version) for r in setup.requests} == {("", 0)}
 
     setup.publish(policy(4))
-    eventually(lambda: TutoringRequest("actor-1", "training", 4) in setup.requests, "it holds it")
+    eventually(
+        lambda: TutoringRequest("actor-1", "training", 4, SAPIEN) in setup.requests, "it holds it"
+    )
     outside = {**situation, "object_y_m": 0.9}
     setup.cases += [Correction("experiment1", 4, outside), asked]
     eventually(lambda: len(setup.sequences) == 1, "a correction")
@@ -343,19 +355,43 @@ def test_a_failed_simulation_is_reported_to_learner_and_evaluator(
     assert "NaN" in shown.problem
 
     setup.publish(policy(4))
-    eventually(lambda: TutoringRequest("actor-1", "training", 4) in setup.requests, "it holds it")
+    eventually(
+        lambda: any(request.policy_version == 4 for request in setup.requests), "it holds it"
+    )
     setup.cases.append(Correction("experiment1", 3, situation))
-    setup.trials.append(Trial(seed=80))
+    setup.trials.append(Trial(80, Conditions("noisy", 1.0, "noisy", 9.0)))
     eventually(lambda: len(setup.failures) == 3, "a correction and a trial fail")
     by_kind = {report.kind: report for report in setup.failures}
     assert by_kind[Kind.CORRECTION].seed == 3
     assert by_kind[Kind.TRIAL].seed == 80
+    assert by_kind[Kind.TRIAL].conditions == Conditions("noisy", 1.0, "noisy", 9.0)
     for kind in (Kind.CORRECTION, Kind.TRIAL):
         assert (by_kind[kind].training, by_kind[kind].policy_version) == ("training", 4)
     metrics = setup.wait_for_metrics(lambda metrics: metrics.outbox == 0 and metrics.failed == 3)
     assert metrics.episodes == 1
     assert [episode.seed for episode in setup.sequences] == [5000]
     assert setup.actor.poll() is None
+
+
+def test_it_plays_trials_and_practises_under_the_conditions_of_suites(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    conditions = Conditions("pushed", 1.0, "pushed", 20.0)
+    unknown = Conditions("mine", 1.0, "darker", 20.0)
+    setup.trials += [Trial(500, conditions), Trial(501, unknown)]
+    setup.publish(policy(1))
+    suites = "evaluator.suites=[{name: pushed, trials: 5}, {name: elsewhere, backend: other}]"
+    corrections = "learner.corrections={rounds: 1, suites: [pushed, elsewhere]}"
+    setup.start_actor("--set", suites, "--set", corrections)
+    eventually(lambda: len(setup.rollouts) >= 3, "two trials, then practice")
+    trial, mine, practice = (rollout.episode for rollout in setup.rollouts[:3])
+    assert (trial.kind, trial.seed, trial.conditions) == (Kind.TRIAL, 500, conditions)
+    assert (mine.kind, mine.seed, mine.conditions) == (Kind.TRIAL, 501, unknown)
+    assert dict(trial.situation) == dict(TASK.sample(500))
+    suite = load_config(None, [suites]).suite("pushed")
+    assert practice.kind is Kind.PRACTICE
+    assert practice.seed in suite.practice_seeds
+    assert practice.conditions == suite.conditions(practice.seed)
 
 
 def test_nothing_is_lost_while_there_is_no_hub(
