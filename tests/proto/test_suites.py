@@ -155,3 +155,18 @@ def test_impossible_conditions_are_refused_on_the_bus() -> None:
         wrong = wire.payload.replace(before, after)
         with pytest.raises(MessageError, match="conditions"):
             decode(type(wire)(wire.encoding, wrong), Trial)
+
+
+def test_the_document_lists_every_disturbance_with_its_strengths() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "generalization.md").read_text()
+    rows = {
+        cells[1].strip("` "): [cell.strip() for cell in cells[2:-1]]
+        for cells in (line.split("|") for line in text.splitlines() if line.startswith("| `"))
+    }
+    for name, disturbance in DISTURBANCES.items():
+        _, usual, allowed, needs = rows[name]
+        low, high = disturbance.usual
+        ends = f"{low:g}" if low == high else f"{low:g} to {high:g}"
+        assert usual == f"{ends} {disturbance.unit}"
+        assert allowed == f"{disturbance.least:g} to {disturbance.most:g} {disturbance.unit}"
+        assert needs == (f"`{disturbance.ability}`" if disturbance.ability else "")
