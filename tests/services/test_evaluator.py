@@ -292,7 +292,7 @@ def counts_by_suite(metrics: EvaluatorMetrics) -> dict[str, int]:
 
 
 def test_each_actor_gets_trials_of_the_suites_that_it_can_play(setup: EvaluatorSetup) -> None:
-    setup.restart("--set", SUITES)
+    setup.restart("--set", SUITES, "--set", "done.trials=2")
     actor, other = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "b")
     able, plain, foreign = Player("sapien", (Ability.SHOVES,)), SAPIEN, Player("other")
     setup.publish(2)

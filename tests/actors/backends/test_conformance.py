@@ -314,7 +314,8 @@ def test_a_knock_turns_its_joint_while_it_lasts(blind):
         expected = sign * np.rad2deg(20.0 / 400.0) * (1 - math.exp(-3))
         assert turned[5, elbow] == pytest.approx(expected, rel=0.1)
         assert turned[14, elbow] == pytest.approx(0.0, abs=0.05)
-        assert np.abs(np.delete(turned, elbow, axis=1)).max() < 0.2 * abs(expected)
+        rest_of_the_arm = np.delete(turned, elbow, axis=1)[:, 2:8]
+        assert np.abs(rest_of_the_arm).max() < 0.2 * abs(expected)
 
 
 def test_more_damping_lets_a_joint_lag(blind):
