@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Final
 
+from actors.disturbances.staging import check_suite
+from actors.tasks.registry import make_task
 from proto.bus import Bus, Inbox
 from proto.config import Config
 from proto.disturbances import DISTURBANCES, Ability
@@ -53,8 +55,12 @@ class Evaluator:
         """Read the trials that were counted before from the run's folder.
 
         Raises:
-            UserError: they cannot be read.
+            UserError: they cannot be read, or a suite cannot be played with the task.
         """
+        if config.evaluator.suites is not None:
+            task = make_task(config.task)
+            for suite in config.suites:
+                check_suite(task, suite)
         self._config = config
         self._bus = bus
         self._lifecycle = lifecycle

@@ -121,22 +121,33 @@ def changed_situation(
     Raises:
         UserError: the task does not name the variable.
     """
-    attribute, unit = VARIABLE_CHANGES[disturbance]
-    name = getattr(task, attribute, "")
-    variables = {each.name: each for each in task.variables if isinstance(each, Continuous)}
-    if name not in variables:
-        raise UserError(
-            f"the task {task.name} cannot be played with the disturbance {disturbance!r}: it names"
-            f" no {attribute}"
-        )
-    before, by = number_of(situation, name), acting.strength * unit * _sign(acting.random)
-    variable = variables[name]
+    variable = changed_variable(task, disturbance)
+    _, unit = VARIABLE_CHANGES[disturbance]
+    before = number_of(situation, variable.name)
+    by = acting.strength * unit * _sign(acting.random)
 
     def outside(value: float) -> float:
         return max(variable.minimum - value, value - variable.maximum, 0.0)
 
     after = min((before + by, before - by), key=outside)
-    return {**situation, name: after}
+    return {**situation, variable.name: after}
+
+
+def changed_variable(task: Task, disturbance: str) -> Continuous:
+    """The variable that a disturbance of VARIABLE_CHANGES changes.
+
+    Raises:
+        UserError: the task does not name it.
+    """
+    attribute, _ = VARIABLE_CHANGES[disturbance]
+    name = getattr(task, attribute, "")
+    for variable in task.variables:
+        if variable.name == name and isinstance(variable, Continuous):
+            return variable
+    raise UserError(
+        f"the task {task.name} cannot be played with the disturbance {disturbance!r}: it names no"
+        f" {attribute}"
+    )
 
 
 def shove_between(before: Scene, after: Scene, step: int) -> Shove:

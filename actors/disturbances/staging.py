@@ -10,8 +10,10 @@ import numpy as np
 from actors.disturbances.pictures import PICTURE_CHANGES, PictureChange
 from actors.disturbances.scenes import (
     SCENE_CHANGES,
+    VARIABLE_CHANGES,
     Acting,
     changed_situation,
+    changed_variable,
     disturbed_steps,
     shove_between,
     shove_step,
@@ -20,7 +22,7 @@ from actors.simulator import Scene, Simulator, abilities_of
 from actors.tasks.contract import Task
 from proto.episode import Image
 from proto.errors import UserError
-from proto.suites import Conditions
+from proto.suites import Conditions, Suite
 from proto.variables import Continuous, Situation, Variable, check_situation
 
 _DISTURBANCE, _SITUATION = 1, 2
@@ -99,6 +101,18 @@ def situation_of(task: Task, conditions: Conditions | None, seed: int) -> Situat
         if any(each.problem(drawn[each.name]) for each in inside):
             return {**situation, **drawn}
     raise UserError(f"a stretch of {conditions.stretch:g} is too small to leave the ranges")
+
+
+def check_suite(task: Task, suite: Suite) -> None:
+    """Refuse a suite that no actor could play with a task.
+
+    Raises:
+        UserError: the task names no variable that a disturbance of the suite changes, or it has no
+            range that can be stretched.
+    """
+    situation_of(task, Conditions(suite.name, suite.stretch), suite.test_seeds.start)
+    for name in suite.disturbances.keys() & VARIABLE_CHANGES.keys():
+        changed_variable(task, name)
 
 
 def check_abilities(simulator: Simulator, conditions: Conditions | None) -> None:

@@ -348,6 +348,15 @@ def test_a_suite_that_no_actor_can_play_is_told_and_not_waited_for(setup: Evalua
     assert not metrics.done, "now it can be waited for"
 
 
+def test_a_suite_that_the_task_cannot_be_played_with_is_bad_input(tmp_path: Path) -> None:
+    words = ("--set", f"run.folder={tmp_path}", "--set", "evaluator.suites=[unlearned, pushed]")
+    with listening_hub(endpoint := free_endpoint()):
+        own = ("--set", "task.name=tests.plain_task:PlainTask")
+        ended = run_vmdnn("evaluator", "--connect", endpoint, *words, *own)
+    assert ended.returncode == 2
+    assert "cannot be played with the disturbance 'pushed'" in ended.stderr
+
+
 def test_a_second_evaluator_of_the_same_folder_is_refused(setup: EvaluatorSetup) -> None:
     setup.wait_for_metrics(lambda _: True)
     second = run_vmdnn("evaluator", *setup.words, "--id", "second")
