@@ -266,8 +266,9 @@ def evaluate(
     config: Config | None = None,
     *,
     trials: int = 52,
-    seed: int = 1000,
+    seed: int | None = None,
     workers: int = 1,
+    suite: str | None = None,
 ) -> Tally:
     """Play trials in situations that were not tutored, and count the successes.
 
@@ -275,16 +276,23 @@ def evaluate(
         policy: the policy, see `make_policy`.
         config: the configuration, which names task and simulator; without it, all defaults.
         trials: number of trials.
-        seed: seed of the first situation; the same seed gives the same situations.
+        seed: seed of the first situation; the same seed gives the same situations. Without it, the
+            first test seed of the suite, or 1000.
         workers: number of processes.
+        suite: name of a suite of the configuration or of a built-in one, such as `disturbed`, in
+            whose simulator and under whose conditions the trials are played.
     """
     from proto.config import Config as Default  # noqa: PLC0415
     from services.playing.workers import play_all  # noqa: PLC0415
-    from services.trials.evaluation import trial_jobs  # noqa: PLC0415
+    from services.trials.evaluation import in_world_of, trial_jobs  # noqa: PLC0415
     from services.trials.success import Tally as Counts  # noqa: PLC0415
 
     config = config or Default()
-    jobs = trial_jobs(config, trials, seed)
+    chosen = None if suite is None else config.suite(suite)
+    if chosen is not None:
+        config = in_world_of(chosen, config)
+    first = 1000 if chosen is None else chosen.test_seeds.start
+    jobs = trial_jobs(config, trials, first if seed is None else seed, suite=chosen)
     played = play_all(config, str(policy), jobs, workers=workers)
     return Counts.of(episode.outcome for _, episode in played)
 

@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from actors.disturbances.staging import check_abilities, stage
 from actors.inquiry import Inquiry
 from actors.left_outboxes import LOOK_EVERY_S, OUTBOXES, LeftOutboxes
 from actors.player import LiveStep, play
@@ -18,7 +19,7 @@ from actors.policies.contract import Policy
 from actors.policies.guided import GuidedPolicy
 from actors.policies.planned import make_tutor
 from actors.receipts import Receipts
-from actors.simulator import make_simulator
+from actors.simulator import make_simulator, player_of
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from learner.checkpoint import Checkpoint
@@ -51,7 +52,8 @@ from proto.outbox import Outbox
 from proto.pace import Pace
 from proto.periodic import every
 from proto.plain_text import plain
-from proto.seeds import PRACTICE
+from proto.situations import situation_of
+from proto.suites import Conditions
 from proto.variables import Situation
 
 LOG = logging.getLogger(__name__)
@@ -78,6 +80,7 @@ class Assignment:
         situation: the situation.
         seed: seed of the episode.
         training: id of the training that the policy comes from, empty for the tutor.
+        conditions: conditions of the suite that it belongs to.
     """
 
     kind: Kind
@@ -86,6 +89,7 @@ class Assignment:
     situation: Situation
     seed: int
     training: str = ""
+    conditions: Conditions | None = None
 
 
 @dataclass(frozen=True)
@@ -137,8 +141,16 @@ class Actor:
     means nothing to another.
     """
 
-    def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
+    def __init__(
+        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, backend: str | None = None
+    ) -> None:
         """Make the simulator, and find the messages that a former process with this id left.
+
+        Args:
+            config: the configuration of the run.
+            bus: connection to the other processes.
+            lifecycle: says when to pause and to stop.
+            backend: name of this actor's simulator; None for `simulator.backend`.
 
         Raises:
             UserError: the simulator cannot run on this machine, or the run's folder cannot be
@@ -153,7 +165,9 @@ class Actor:
         self._tasks = {self._task.name: self._task}
         if (first := config.pretraining_task) is not None:
             self._tasks[first] = make_task(config.task_called(first))
-        self._simulator = make_simulator(config.simulator)
+        chosen = {} if backend is None else {"backend": backend}
+        self._simulator = make_simulator(config.simulator.model_copy(update=chosen))
+        self._player = player_of(self._simulator)
         folder = config.run_folder / "outbox" / bus.id
         self._sequences, self._rollouts = (
             Outbox(folder / each, self._deliver) for each in OUTBOXES
@@ -302,7 +316,9 @@ class Actor:
         if len(self._sequences) >= OUTBOX_LIMIT:
             return None
         version = self._policy.version if self._policy else 0
-        request = TutoringRequest(self._bus.id, self._policy_run, version, self._agreement.digest)
+        request = TutoringRequest(
+            self._bus.id, self._policy_run, version, self._agreement.digest, self._player
+        )
         for answer in self._ask_learner.answers(request):
             try:
                 if isinstance(answer, Correction):
@@ -332,13 +348,19 @@ class Actor:
             UserError: there is no policy, or the situation is not one of the task.
         """
         task = self._task_called(asked.task)
-        task.check(asked.situation)
+        self._check(task, asked.situation, asked.conditions, asked.seed)
         if self._policy is None:
             raise UserError("there is no policy to be guided")
         tutor = make_tutor(task)
         guided = GuidedPolicy(self._policy, tutor, self._config.tutor.guidance_deg)
         return Assignment(
-            Kind.CORRECTION, task, guided, asked.situation, asked.seed, self._policy_run
+            Kind.CORRECTION,
+            task,
+            guided,
+            asked.situation,
+            asked.seed,
+            self._policy_run,
+            asked.conditions,
         )
 
     def _task_called(self, name: str) -> Task:
@@ -350,27 +372,62 @@ class Actor:
         """A trial of this policy that the evaluator asks for; None if there is none."""
         if self._policy is None or len(self._rollouts) >= OUTBOX_LIMIT:
             return None
-        request = TrialRequest(
-            self._bus.id, self._policy_run, self._policy.version, self._agreement.digest
-        )
+        version, digest = self._policy.version, self._agreement.digest
+        request = TrialRequest(self._bus.id, self._policy_run, version, digest, self._player)
         for trial in self._ask_evaluator.answers(request):
-            situation = self._task.sample(trial.seed)
-            return Assignment(
-                Kind.TRIAL, self._task, self._policy, situation, trial.seed, self._policy_run
-            )
+            try:
+                return self._rollout(Kind.TRIAL, self._policy, trial.seed, trial.conditions)
+            except UserError as error:
+                LOG.warning("the evaluator's trial cannot be played: %s", plain(error))
         return None
 
     def _practice(self) -> Assignment | None:
-        """A random situation; None without a policy, or if practice is off or ahead of receipts."""
+        """A random situation of a suite that is practised, and that this actor can play.
+
+        None without a policy, without such a suite, or if practice is off or ahead of receipts.
+        """
         if self._policy is None or not self._config.actor.practice:
             return None
         if len(self._rollouts) >= PRACTICE_LIMIT:
             return None
-        seed = secrets.choice(PRACTICE)
-        situation = self._task.sample(seed)
-        return Assignment(
-            Kind.PRACTICE, self._task, self._policy, situation, seed, self._policy_run
-        )
+        drawn = [
+            (seed, suite.conditions(seed))
+            for suite in self._config.practised_suites()
+            for seed in (secrets.choice(suite.practice_seeds),)
+            if self._player.can_play(suite.backend, suite.conditions(seed))
+        ]
+        if not drawn:
+            return None
+        seed, conditions = secrets.choice(drawn)
+        try:
+            return self._rollout(Kind.PRACTICE, self._policy, seed, conditions)
+        except UserError as error:
+            LOG.warning("a situation cannot be practised: %s", error)
+            return None
+
+    def _rollout(
+        self, kind: Kind, policy: Policy, seed: int, conditions: Conditions | None
+    ) -> Assignment:
+        """An episode of the policy in the situation of a seed.
+
+        Raises:
+            UserError: the task cannot be played under these conditions.
+        """
+        situation = situation_of(self._task, conditions, seed)
+        self._check(self._task, situation, conditions, seed)
+        return Assignment(kind, self._task, policy, situation, seed, self._policy_run, conditions)
+
+    def _check(
+        self, task: Task, situation: Situation, conditions: Conditions | None, seed: int
+    ) -> None:
+        """Check that an episode can be played.
+
+        Raises:
+            UserError: the situation is not one of the task, or task or simulator cannot be
+                disturbed as the conditions say.
+        """
+        check_abilities(self._simulator, conditions)
+        stage(task, situation, conditions, seed)
 
     def _play(self, assignment: Assignment) -> Episode:
         live_key = self._bus.keys.live(self._bus.id)
@@ -395,6 +452,7 @@ class Actor:
                 actor=self._bus.id,
                 config_digest=self._agreement.digest,
                 on_step=on_step,
+                conditions=assignment.conditions,
             )
         except (_StoppedError, UserError, OSError, MemoryError):
             raise  # nothing is wrong with the episode
@@ -451,6 +509,7 @@ class Actor:
             training=failed.training,
             policy_version=failed.policy.version,
             problem=plain(problem)[:1000],
+            conditions=failed.conditions,
         )
         outbox, receiver = self._sequences, Role.LEARNER
         if failed.kind is Kind.TRIAL:

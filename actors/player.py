@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.attention import clip_action, crop_of_focus, targets_of_action, with_attention_of
-from actors.policies.contract import Policy
+from actors.disturbances.staging import check_abilities, stage
+from actors.policies.contract import InformedPolicy, Policy
 from actors.simulator import Simulator
 from actors.tasks.contract import Task
 from actors.view import view_of
 from proto.body import FOCUS
 from proto.episode import Episode, Image, Kind
+from proto.suites import Conditions
 from proto.variables import Situation
 
 Array = NDArray[np.float64]
@@ -52,6 +54,7 @@ def play(
     actor: str = "local",
     config_digest: str = "",
     on_step: Callable[[LiveStep], None] | None = None,
+    conditions: Conditions | None = None,
 ) -> Episode:
     """Play one episode from the task's start posture.
 
@@ -69,29 +72,36 @@ def play(
         config_digest: digest of the effective configuration.
         on_step: called in each control step before the robot moves. An exception that it raises
             ends the episode at once.
+        conditions: the conditions of the suite that the episode belongs to; None for an episode
+            without disturbances inside the ranges. The recorded pictures are those that the policy
+            saw. The judge measures from where the object is after an outside hand moved it.
 
     Raises:
-        UserError: the situation is not valid for the task.
+        UserError: the situation is not valid for the task, or task or simulator cannot be disturbed
+            as the conditions say.
     """
-    task.check(situation)
+    check_abilities(simulator, conditions)
+    staging = stage(task, situation, conditions, seed)
     started_s = time.time()
-    scene = task.scene(situation)
-    simulator.reset(scene)
-    judge = task.judge(situation)
+    simulator.reset(staging.scene)
+    judge = task.judge(staging.situation)
     policy.begin(situation, seed)
     names = tuple(simulator.bodies().places)
     images, crops, actions, targets, joints, poses, outputs = [], [], [], [], [], [], []
     focus = float(task.start[FOCUS])
     for step, phase in enumerate(task.phases):
+        if step == staging.changed_at and isinstance(policy, InformedPolicy):
+            policy.change(staging.situation)
         crops.append(crop_of_focus(focus))
         seen = simulator.observe(crops[-1])
-        action = _with_task_attention(task, clip_action(policy.step(seen.image)))
+        image = staging.picture(step, seen.image)
+        action = _with_task_attention(task, clip_action(policy.step(image)))
         poses.append(simulator.bodies().rows)
         if on_step is not None:
-            on_step(LiveStep(step, task.phase_names[phase], seen.image, seen.joints_deg, action))
+            on_step(LiveStep(step, task.phase_names[phase], image, seen.joints_deg, action))
         report = simulator.step(targets_of_action(action))
         judge.watch(report, simulator.joints_deg(), simulator.bodies())
-        images.append(seen.image)
+        images.append(image)
         actions.append(action)
         targets.append(
             action if policy.target is None else _with_task_attention(task, policy.target)
@@ -123,7 +133,8 @@ def play(
         outputs=np.asarray(outputs, dtype=np.float32) if outputs else None,
         control_period_s=simulator.control_period_s,
         started_s=started_s,
-        view=view_of(scene, crops),
+        view=view_of(staging.scene, crops),
+        conditions=conditions,
     )
 
 

@@ -5,23 +5,27 @@ top, straight below the origin of the robot's root link. The paper's task frame 
 x_world = -X_task, y_world = Y_task, z_world = Z_task, and a yaw changes its sign.
 
 Only a backend's own folder imports its simulator. During an episode nothing is welded, attached or
-teleported: what is lifted is lifted by friction.
+teleported: what is lifted is lifted by friction. Only the outside hand of a disturbance (`Shove`)
+moves a box otherwise.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Final, Protocol
+from typing import ClassVar, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from proto.config import SimulatorConfig
+from proto.disturbances import Ability
 from proto.errors import UserError
 from proto.extensions import load_class
+from proto.suites import Player
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -134,20 +138,96 @@ class Screen:
 
 
 @dataclass(frozen=True)
+class Shove:
+    """An outside hand moves a box during one control step, in a straight line and evenly.
+
+    In each of the n physics steps of the control step the box's pose changes by 1/n of the shove,
+    from wherever the box is; then its velocity is zero.
+
+    Attributes:
+        box: name of a box that can move.
+        step: the control step, counted from 0.
+        shift_m: movement along x and y of the world frame.
+        turn_deg: turn about the vertical through the box's centre, counter-clockwise from above.
+    """
+
+    box: str
+    step: int
+    shift_m: tuple[float, float]
+    turn_deg: float
+
+    def moved(self, pose: Pose, share: float) -> Pose:
+        """The pose of the box after a share 0..1 of the shove."""
+        x, y, z = pose.position_m
+        w, i, j, k = pose.quaternion
+        half = math.radians(share * self.turn_deg) / 2
+        cos, sin = math.cos(half), math.sin(half)
+        return Pose(
+            (x + share * self.shift_m[0], y + share * self.shift_m[1], z),
+            (cos * w - sin * k, cos * i - sin * j, cos * j + sin * i, cos * k + sin * w),
+        )
+
+
+@dataclass(frozen=True)
+class Knock:
+    """An outside torque acts on a joint, besides that of its drive.
+
+    Attributes:
+        joint: name of the joint.
+        torque_nm: the torque in the direction of the joint's positive angles (Nm).
+        step: first control step, counted from 0.
+        steps: number of control steps.
+    """
+
+    joint: str
+    torque_nm: float
+    step: int
+    steps: int
+
+
+UNTURNED: Final = (1.0, 0.0, 0.0, 0.0)
+"""The quaternion (w first) that turns nothing."""
+
+
+@dataclass(frozen=True)
 class Scene:
-    """The initial state of an episode.
+    """The initial state of an episode, and what happens to it from outside.
+
+    The last four attributes are disturbances. A simulator can play those that its `abilities` name;
+    it is not given others.
 
     Attributes:
         boxes: table, obstacle, objects.
         start: posture in which the robot starts, at rest.
         table_drop_m: how far the table top lies below the robot's root link (m).
         screen: a screen, if there is one.
+        shoves: boxes that an outside hand moves.
+        knocks: outside torques on joints.
+        damping: by joint, the factor of the damping of its drive (`actors.backends.robot.Drive`).
+        eye_turn: unit quaternion (w first) by which the eye's camera is turned in the frame of the
+            eye's link: x along the optical axis, y to the left, z up.
     """
 
     boxes: tuple[Box, ...]
     start: JointTargets
     table_drop_m: float
     screen: Screen | None = None
+    shoves: tuple[Shove, ...] = ()
+    knocks: tuple[Knock, ...] = ()
+    damping: Mapping[str, float] = field(default_factory=dict)
+    eye_turn: tuple[float, float, float, float] = UNTURNED
+
+    def shoves_at(self, step: int) -> list[Shove]:
+        """The shoves of a control step."""
+        return [shove for shove in self.shoves if shove.step == step]
+
+    def torques_nm(self, step: int) -> dict[str, float]:
+        """The outside torques of a control step, by joint."""
+        return {
+            knock.joint: knock.torque_nm
+            for knock in self.knocks
+            if knock.step <= step < knock.step + knock.steps
+        }
 
 
 @dataclass(frozen=True)
@@ -222,10 +302,12 @@ class Simulator(Protocol):
     Attributes:
         name: the backend's name in the config and in recordings; `make_simulator` sets it.
         control_period_s: duration of one control step.
+        abilities: which disturbances of a `Scene` it can play.
     """
 
     name: str
     control_period_s: float
+    abilities: ClassVar[frozenset[Ability]] = frozenset()
 
     @abstractmethod
     def __init__(self, config: SimulatorConfig) -> None:
@@ -307,6 +389,16 @@ def is_installed(backend: str) -> bool:
 def installed_backends() -> tuple[str, ...]:
     """Names of the built-in backends whose Python package is installed."""
     return tuple(name for name in BACKENDS if is_installed(name))
+
+
+def player_of(simulator: Simulator) -> Player:
+    """What can be played with a simulator."""
+    return Player(simulator.name, tuple(sorted(abilities_of(simulator))))
+
+
+def abilities_of(simulator: Simulator) -> frozenset[Ability]:
+    """Which disturbances a simulator can play; none if its class does not say."""
+    return frozenset(getattr(simulator, "abilities", ()))
 
 
 def load_backend(name: str) -> type[Simulator]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Final
@@ -27,7 +28,7 @@ from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
-from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore
+from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore, SuiteScore
 from proto.run_locks import owned_run
 from services.arguments.common import config_argument, integer
 from services.board import Board, RunView
@@ -54,7 +55,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments.backend is not None:
             overrides.append(f"simulator.backend={arguments.backend}")
         config = load_config(arguments.config, overrides)
-        actors = default_actors() if arguments.actors is None else arguments.actors
+        actors = actors_of(arguments.actors, config)
+        check_actors(actors, config)
         check_can_be_done(config)
         if trouble := port_trouble(config.hub.endpoint):
             raise UserError(trouble)
@@ -84,12 +86,58 @@ def default_actors() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def run(config: Config, actors: int, console: Console) -> None:
+def actors_of(given: Mapping[str, int] | int | None, config: Config) -> Mapping[str, int]:
+    """Return the number of actors by simulator.
+
+    Args:
+        given: numbers by simulator; a number of actors with `simulator.backend`; or None for one
+            actor for each core, which uses the processor time that the learner leaves.
+        config: the configuration.
+    """
+    if isinstance(given, Mapping):
+        return given
+    number = len(os.sched_getaffinity(0)) if given is None else given
+    return {config.simulator.backend: number}
+
+
+def check_actors(actors: Mapping[str, int], config: Config) -> None:
+    """Check that there is an actor for every suite and for the tutor.
+
+    Without any actor here, all are expected to join from elsewhere; `NAME=0` says so of one
+    simulator.
+
+    Raises:
+        UserError: no actor has a simulator that the configuration names.
+    """
+    if not any(actors.values()):
+        return
+    wanted = [f"{backend}=1" for backend in _backends_of(config)]
+    advice = (
+        f"start one with --actors {','.join(wanted)}, or write 0 in place of 1 if such actors join"
+        " from elsewhere"
+    )
+    for suite in (*config.suites, *config.practised_suites()):
+        if suite.backend not in actors:
+            raise UserError(
+                f"no actor has the simulator {suite.backend} of the suite {suite.name}; {advice}"
+            )
+    if not set(config.tutoring_backends) & set(actors):
+        names = " or ".join(config.tutoring_backends)
+        raise UserError(f"no actor has the simulator {names} of tutor.backends; {advice}")
+
+
+def _backends_of(config: Config) -> list[str]:
+    """Return the names of all simulators that a run needs."""
+    suites = (suite.backend for suite in config.suites)
+    return list(dict.fromkeys([config.simulator.backend, *config.tutoring_backends, *suites]))
+
+
+def run(config: Config, actors: Mapping[str, int], console: Console) -> None:
     """Play a run until it is done or this process is to stop.
 
     Args:
         config: the configuration of the run.
-        actors: number of actors.
+        actors: number of actors by simulator.
         console: shows the state of the run.
 
     Raises:
@@ -101,7 +149,7 @@ def run(config: Config, actors: int, console: Console) -> None:
         _run(config, actors, console)
 
 
-def _run(config: Config, actors: int, console: Console) -> None:
+def _run(config: Config, actors: Mapping[str, int], console: Console) -> None:
     started_s = time.monotonic()
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
@@ -110,9 +158,10 @@ def _run(config: Config, actors: int, console: Console) -> None:
     # The learner writes config.yaml of the run, after it has checked that the run can continue.
     file = logs / "config.yaml"
     config.save(file)
+    number = sum(actors.values())
     console.print(
-        f"{'continuing' if exists else 'starting'} run {config.run.name} with {actors} "
-        f"{'actor' if actors == 1 else 'actors'} in {config.run_folder}",
+        f"{'continuing' if exists else 'starting'} run {config.run.name} with {number} "
+        f"{'actor' if number == 1 else 'actors'} in {config.run_folder}",
         highlight=False,
         soft_wrap=True,
     )
@@ -133,8 +182,14 @@ def _run(config: Config, actors: int, console: Console) -> None:
         console.print(text, highlight=False, soft_wrap=True)
 
 
-def programs(config: Config, file: Path, actors: int) -> list[Program]:
-    """Return the programs of a run, in the order in which they are started."""
+def programs(config: Config, file: Path, actors: Mapping[str, int]) -> list[Program]:
+    """Return the programs of a run, in the order in which they are started.
+
+    Args:
+        config: the configuration of the run.
+        file: its file.
+        actors: number of actors by simulator.
+    """
 
     def vmdnn(role: Role) -> tuple[str, ...]:
         return (VMDNN, role.value, "--config", str(file))
@@ -150,8 +205,11 @@ def programs(config: Config, file: Path, actors: int) -> list[Program]:
         Program("evaluator", vmdnn(Role.EVALUATOR)),
         Program("recorder", vmdnn(Role.RECORDER)),
     ]
-    if actors:
-        started.append(Program("actor", vmdnn(Role.ACTOR), processes=actors))
+    present = {backend: number for backend, number in actors.items() if number}
+    for backend, number in present.items():
+        chosen = () if backend == config.simulator.backend else ("--backend", backend)
+        name = "actor" if len(present) == 1 else f"actor-{re.sub('[^A-Za-z0-9]+', '-', backend)}"
+        started.append(Program(name, (*vmdnn(Role.ACTOR), *chosen), processes=number))
     return started
 
 
@@ -185,7 +243,7 @@ def summary(view: RunView, config: Config, wall_s: float) -> str:
     lines = [
         f"run {config.run.name}: {view.policy_version} policy versions"
         f" in {minutes} min {seconds} s",
-        *_score_lines(_newest_counted(view.scores, config), config),
+        *_suite_lines(view.suites),
         f"files: {config.run_folder}/ with config.yaml, tutoring, checkpoints, policies, "
         "rollouts, evaluation, logs",
     ]
@@ -215,16 +273,29 @@ def _connect(config: Config, watchdog: Watchdog, lifecycle: Lifecycle) -> Bus | 
     return None
 
 
-def _newest_counted(scores: Sequence[PolicyScore], config: Config) -> PolicyScore | None:
+def _suite_lines(suites: Sequence[SuiteScore]) -> list[str]:
+    """Return the result of each suite in a few lines; with one suite, without its name."""
+    named = len(suites) > 1
+    lines = [
+        f"{suite.name}, {line}" if named and not line.startswith(" ") else line
+        for suite in suites
+        for line in _score_lines(suite)
+    ]
+    return lines or ["no trial was counted"]
+
+
+def _newest_counted(suite: SuiteScore) -> PolicyScore | None:
     """Return the score of the newest policy with all trials counted, or else with any counted."""
-    complete = [score for score in scores if score.trials >= config.evaluator.trials_per_policy]
+    scores = suite.policies
+    complete = [score for score in scores if score.trials >= suite.trials]
     return max(complete or scores, key=lambda score: score.version, default=None)
 
 
-def _score_lines(score: PolicyScore | None, config: Config) -> list[str]:
+def _score_lines(suite: SuiteScore) -> list[str]:
+    score = _newest_counted(suite)
     if score is None:
-        return ["no trial was counted"]
-    counted = f"{score.trials} of {config.evaluator.trials_per_policy} trials counted"
+        return ["no trial was counted" + (f": {suite.unplayable}" if suite.unplayable else "")]
+    counted = f"{score.trials} of {suite.trials} trials counted"
     return [
         f"policy {score.version}, {counted}; successes, rate and its 95 % interval:",
         *(
@@ -238,10 +309,26 @@ def _score_lines(score: PolicyScore | None, config: Config) -> list[str]:
     ]
 
 
+def _actors(text: str) -> Mapping[str, int] | int:
+    """Parse a number of actors, or numbers by simulator such as `sapien=1,mujoco=1`."""
+    number = integer(0)
+    if "=" not in text:
+        return int(number(text))
+    actors: dict[str, int] = {}
+    for part in text.split(","):
+        backend, equals, count = part.strip().rpartition("=")
+        if not equals or not backend or backend in actors:
+            raise argparse.ArgumentTypeError(
+                f"{text!r}: write a number, or one for each simulator such as sapien=1,mujoco=1"
+            )
+        actors[backend] = number(count)
+    return actors
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="run_local", add_help=False)  # run_local.sh prints it
     parser.add_argument("--config", type=config_argument, default=DEFAULT_CONFIG)
-    parser.add_argument("--actors", type=integer(0))
+    parser.add_argument("--actors", type=_actors)
     parser.add_argument("--backend")
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     return parser

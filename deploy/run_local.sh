@@ -4,7 +4,7 @@ set -euo pipefail
 
 usage() {
     cat <<'END'
-usage: deploy/run_local.sh [--config FILE] [--actors N] [--backend NAME] [--set KEY=VALUE ...]
+usage: deploy/run_local.sh [--config FILE] [--actors N|NAME=N,...] [--backend NAME] [--set KEY=VALUE ...]
 
 Sets up this machine if necessary (.venv with the locked packages and, as root or with sudo, a
 graphics driver), then starts hub, learner, evaluator, recorder and actors. Processes that end or
@@ -13,7 +13,8 @@ stops all processes and prints a summary. The same command continues a run that 
 
   --config FILE     a file, or the name of a configuration in deploy/config (default:
                     experiment1); smoke takes a few minutes
-  --actors N        number of actors (default: one for each core)
+  --actors N        number of actors (default: one for each core); or numbers by simulator, such as
+                    sapien=1,mujoco=1
   --backend NAME    the simulator: a built-in one, or your own as package.module:Class
   --set KEY=VALUE   override a value of the config, such as learner.rate=1e-3; may be repeated
 

@@ -117,10 +117,10 @@ for name in installed_backends(): load_backend(name)')
 
 # Each simulator reports whether it can render, and which packages provide its driver.
 setup_simulator() {
-    local answer packages status=0
+    local answer extra packages status=0
     answer="$(examine_simulator "$@" 2>/dev/null)" || status=$?
     if ((status == 3)); then
-        install_extra "$answer"
+        for extra in $answer; do install_extra "$extra"; done
         status=0
         answer="$(examine_simulator "$@" 2>/dev/null)" || status=$?
     fi
@@ -142,7 +142,7 @@ setup_simulator() {
 }
 
 # Succeeds if the selected simulator can render. Otherwise it prints the packages to install, if any,
-# and writes to standard error what is wrong and what to do. With status 3 it prints the extra to install.
+# and writes to standard error what is wrong and what to do. With status 3 it prints the extras to install.
 examine_simulator() {
     "$VENV/bin/python" -m actors.backends --config "$ROOT/deploy/config/experiment1.yaml" "$@"
 }

@@ -57,6 +57,7 @@ from proto.messages import (
 from proto.metrics import LearnerMetrics, Stage
 from proto.pace import Pace
 from proto.plain_text import plain
+from proto.players import Players
 from proto.recordings.episodes import EpisodeSummary
 from proto.seeds import SEEDS_PER_CASE
 from proto.senders import Sender
@@ -140,6 +141,8 @@ class Learner:
         self._published: tuple[int, CheckpointMetadata, bytes] | None = None
         self._find_newest_policy()
         self._round = self._make_round(resumed=True)
+        self._players = Players()
+        self._unplayable = ""
         self._given_up = 0
         for shown in found:
             self._note(shown)
@@ -167,6 +170,7 @@ class Learner:
                 self._lifecycle.waits_for("" if may_train else self._missing)
                 self._receive(sequences, wait_s=0.0 if may_train else IDLE_S)
                 self._receive_failures(failures)
+                self._look_for_players()
                 if may_train:
                     self._train()
         LOG.info(self.checkpoint())
@@ -262,15 +266,31 @@ class Learner:
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
 
     def _hand_out(self, request: TutoringRequest) -> TutoringCase | Correction | None:
-        if self._lifecycle.paused:
-            return None
         if request.config_digest != self._agreement.digest:
             self._bus.refuse(f"actor/{request.actor}", OTHER_SETTINGS)
             return None
-        case, awaited = self._curriculum.next_case(request.actor), self._round
-        if case is not None or awaited is None:
-            return case
-        return awaited.next_correction(request)
+        self._players.note(request.actor, request.player)
+        if self._lifecycle.paused:
+            return None
+        awaited = self._round
+        if request.player.backend in self._config.tutoring_backends:
+            case = self._curriculum.next_case(request.actor)
+            if case is not None:
+                return case
+        return None if awaited is None else awaited.next_correction(request)
+
+    def _look_for_players(self) -> None:
+        """Log once if no present actor can play what is waited for."""
+        problem, awaited = "", self._round
+        backends = self._config.tutoring_backends
+        if self._curriculum.missing:
+            if self._players.lack(lambda player: player.backend in backends):
+                problem = f"cases are not shown: no actor has {' or '.join(backends)}"
+        elif awaited is not None and self._players.lack(awaited.is_played_by):
+            problem = f"round {awaited.number} waits: no actor can practise or correct in it"
+        if problem and problem != self._unplayable:
+            LOG.warning(problem)
+        self._unplayable = problem
 
     def _on_verdict(self, verdict: Verdict, sender: Sender) -> None:
         awaited = self._round
@@ -278,6 +298,7 @@ class Learner:
             self._bus.refuse(str(sender), f"a verdict is ignored: {problem}")
 
     def _on_presence(self, actor: str, alive: bool) -> None:
+        self._players.presence(actor, alive)
         if alive:
             return
         self._curriculum.release(actor)
@@ -346,7 +367,7 @@ class Learner:
         if episode.kind is Kind.TUTORING:
             wanted: Situation | None = task.tutored()[episode.seed // SEEDS_PER_CASE]
         else:
-            wanted = situation_of_correction(episode.seed, task)
+            wanted = situation_of_correction(episode, self._config.practised_suites(), task)
         if wanted is None or not same_situation(episode.situation, wanted):
             return f"its situation is not the one of the seed {episode.seed}"
         return misfit(episode, task, self._config.simulator.control_period_s)

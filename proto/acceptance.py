@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from proto.body import ACTION_VALUES
 from proto.episode import LARGEST_DEG, Floats
 from proto.errors import UserError
-from proto.variables import Situation, Variable, check_situation
+from proto.situations import DrawnTask, variables_of
+from proto.suites import Conditions
+from proto.variables import Situation, check_situation
 
 _ROUNDING: Final = 1e-3
 """Actions are float32."""
@@ -23,16 +25,8 @@ _LOWEST: Final = np.array([value.minimum for value in ACTION_VALUES])
 _HIGHEST: Final = np.array([value.maximum for value in ACTION_VALUES])
 
 
-class PlayedTask(Protocol):
-    """What must be known of a task to tell whether an episode is one of it.
-
-    Attributes:
-        name: its name in configurations.
-        variables: the variables of its situations.
-    """
-
-    name: str
-    variables: tuple[Variable, ...]
+class PlayedTask(DrawnTask, Protocol):
+    """What must be known of a task to tell whether an episode is one of it."""
 
     @property
     def phases(self) -> NDArray[np.uint8]:
@@ -41,9 +35,6 @@ class PlayedTask(Protocol):
     def tutored(self) -> Sequence[Situation]:
         """Return the tutored situations, always in the same order."""
 
-    def sample(self, seed: int) -> Situation:
-        """Draw a random situation; the same seed gives the same one."""
-
 
 class Played(Protocol):
     """What is checked of an episode: an `Episode`, or the summary of a recorded one."""
@@ -51,6 +42,10 @@ class Played(Protocol):
     @property
     def situation(self) -> Situation:
         """The values of the task's variables."""
+
+    @property
+    def conditions(self) -> Conditions | None:
+        """The conditions of the suite that it belongs to; None for those of `unlearned`."""
 
     @property
     def control_period_s(self) -> float:
@@ -78,7 +73,7 @@ def misfit(episode: Played, task: PlayedTask, control_period_s: float) -> str:
         control_period_s: time of a control step in the run (s).
     """
     return (
-        situation_misfit(episode.situation, task)
+        _situation_misfit(episode, task)
         or _shape_misfit(episode, task, control_period_s)
         or _values_misfit(episode)
     )
@@ -105,10 +100,9 @@ def _values_misfit(episode: Played) -> str:
     return ""
 
 
-def situation_misfit(situation: Situation, task: PlayedTask) -> str:
-    """Return why a situation is none of a task; empty if it is one."""
+def _situation_misfit(episode: Played, task: PlayedTask) -> str:
     try:
-        check_situation(situation, task.variables, task.name)
+        check_situation(episode.situation, variables_of(task, episode.conditions), task.name)
     except UserError as error:
         return str(error)
     return ""

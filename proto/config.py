@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
@@ -14,6 +14,7 @@ import yaml
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationError,
@@ -22,10 +23,22 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
+from proto.disturbances import DISTURBANCES
 from proto.errors import UserError
-from proto.seeds import SEEDS_PER_CASE, TRIALS_BELOW
+from proto.seeds import PRACTICE, SEEDS_PER_CASE, TRIALS_BELOW
 from proto.storage import written_whole
 from proto.strict_yaml import WrittenFloat, WrittenInt, dump_yaml, load_yaml
+from proto.suites import (
+    BUILT_IN,
+    MOST_STRETCH,
+    MOST_SUITES,
+    PRACTICE_OF_SUITE,
+    PRACTICE_SEEDS,
+    UNLEARNED,
+    Suite,
+    first_practice_seed,
+    first_test_seed,
+)
 
 # Strict: a text or a truth value is not accepted as a number.
 Switch = Annotated[bool, Field(strict=True)]
@@ -197,12 +210,14 @@ class TutorConfig(_Section):
         noise_correlation_steps: correlation time of the execution noise (control steps).
         guidance_deg: largest difference between the actions of neck and arm and the tutor's plan
             in a correction (degrees).
+        backends: names of the simulators whose actors show cases; None for `simulator.backend`.
     """
 
     repeats: Repeats = 4
     noise_deg: NotNegative = 1.0
     noise_correlation_steps: Positive = 20.0
     guidance_deg: NotNegative = 5.0
+    backends: Annotated[tuple[str, ...], Field(min_length=1)] | None = None
 
 
 class SubnetConfig(_Section):
@@ -298,10 +313,14 @@ class CorrectionsConfig(_Section):
         sequences: corrections in a round; fewer if `tutored` is chosen and there are fewer cases.
         tries: episodes of practice that are judged in a round to find failures.
         epochs: epochs of training in a round.
+        suites: names of the suites that are practised, and whose failures are chosen: `unlearned`
+            or suites of `EvaluatorConfig.suites`. Each has seeds for practice besides those of its
+            trials.
     """
 
     rounds: Natural = 0
     choose: Literal["failures", "random", "tutored"] = "failures"
+    suites: Annotated[tuple[str, ...], Field(min_length=1)] = (UNLEARNED,)
     sequences: Count = 45
     tries: Count = 200
     epochs: Count = 200
@@ -390,6 +409,89 @@ class ComparisonConfig(_Section):
     feed_forward: FeedForwardConfig = FeedForwardConfig()
 
 
+def _strengths(values: Any) -> Any:
+    """Complete strengths by name: None is the usual range, a number is both ends of a range."""
+    if not isinstance(values, Mapping):
+        raise ValueError("expected disturbances by name, such as {pushed: [10, 30]}")
+    return {str(name): _strength(str(name), value) for name, value in values.items()}
+
+
+def _strength(name: str, value: Any) -> tuple[float, float]:
+    if name not in DISTURBANCES:
+        raise ValueError(f"there is no disturbance {name!r}; there are {', '.join(DISTURBANCES)}")
+    disturbance = DISTURBANCES[name]
+    ends = disturbance.usual if value is None else value
+    ends = ends if isinstance(ends, list | tuple) else (ends, ends)
+    numbers = [end for end in ends if isinstance(end, int | float) and not isinstance(end, bool)]
+    if len(numbers) != 2 or len(ends) != 2:
+        raise ValueError(f"{name}: expected a strength or a range of two, such as [10, 30]")
+    weakest, strongest = (float(number) for number in numbers)
+    if problem := disturbance.problem(weakest) or disturbance.problem(strongest):
+        raise ValueError(f"{name}: {problem}")
+    if weakest > strongest:
+        raise ValueError(f"{name}: the range {weakest:g} .. {strongest:g} is upside down")
+    return weakest, strongest
+
+
+Strengths = Annotated[dict[str, tuple[float, float]], BeforeValidator(_strengths)]
+
+
+class SuiteConfig(_Section):
+    """A suite: situations and conditions on which every policy version is tried.
+
+    In YAML a name alone is a suite, too. What is not given has the value of the built-in suite of
+    this name (`proto.suites.BUILT_IN`), if there is one.
+
+    Attributes:
+        name: its name.
+        trials: number of trials of each policy version; None for `trials_per_policy`.
+        seed: seed of the first trial; None for `evaluator.seed` in the suite `unlearned`, and for
+            seeds that the name selects in the others.
+        practice_seed: first seed of its practice; None for `proto.seeds.PRACTICE` in the suite
+            `unlearned`, and for seeds that the name selects in the others.
+        stretch: factor by which the ranges of the task's variables are stretched; with more than 1
+            all situations lie outside the tutored ranges.
+        disturbances: strength by name, a number or a range [weakest, strongest], or nothing for the
+            usual range; see `proto.disturbances`. In each trial one of them acts.
+        backend: name of the simulator in which it is played; None for `simulator.backend`.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+    trials: Annotated[int, Field(strict=True, ge=1, le=2**28)] | None = None
+    seed: Annotated[int, Field(strict=True, ge=0, lt=TRIALS_BELOW)] | None = None
+    practice_seed: (
+        Annotated[
+            int,
+            Field(
+                strict=True,
+                ge=PRACTICE_SEEDS.start,
+                le=PRACTICE_SEEDS.stop - PRACTICE_OF_SUITE,
+            ),
+        ]
+        | None
+    ) = None
+    stretch: Annotated[float, Field(strict=True, ge=1, le=MOST_STRETCH)] = 1.0
+    disturbances: Strengths = Field(default_factory=dict)
+    backend: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, values: Any) -> Any:
+        """Accept a name alone, and complete a suite with the values of the built-in one."""
+        if isinstance(values, str):
+            values = {"name": values}
+        if not isinstance(values, dict) or not isinstance(values.get("name"), str):
+            return values
+        given = {name: value for name, value in values.items() if value is not None}
+        return {**BUILT_IN.get(values["name"], {}), **given}
+
+
+def _check_suites(suites: tuple[SuiteConfig, ...]) -> tuple[SuiteConfig, ...]:
+    if not 1 <= len(suites) <= MOST_SUITES:
+        raise ValueError(f"expected 1 to {MOST_SUITES} suites; leave the key out for `unlearned`")
+    return suites
+
+
 class EvaluatorConfig(_Section):
     """Trials of each policy version in situations that were not tutored.
 
@@ -397,12 +499,14 @@ class EvaluatorConfig(_Section):
         trials_per_policy: number of trials of each policy version.
         seed: seed of the first trial; trial i has the seed `seed + i`.
         lease_s: a trial that is not finished after this time is assigned again (s).
+        suites: the suites, the most important first; None for `unlearned` alone.
     """
 
     trials_per_policy: Annotated[int, Field(strict=True, ge=1, le=2**28)] = 52
     # The bound keeps the seeds of all trials below those of corrections and practice.
     seed: Annotated[int, Field(strict=True, ge=0, le=TRIALS_BELOW - 2**28)] = 1000
     lease_s: Positive = 60.0
+    suites: Annotated[tuple[SuiteConfig, ...], AfterValidator(_check_suites)] | None = None
 
 
 class KeepConfig(_Section):
@@ -437,8 +541,9 @@ class DoneConfig(_Section):
 
     Attributes:
         policy_versions: number of policy versions to publish.
-        trials: number of trials of the newest policy version to count. With `policy_versions`,
-            the newest version must be that one or a later one.
+        trials: number of trials of the newest policy version to count in each suite, or all trials
+            of a suite that has fewer. Suites that no actor can play are left out. With
+            `policy_versions`, the newest version must be that one or a later one.
     """
 
     policy_versions: Count | None = None
@@ -490,17 +595,96 @@ class Config(_Section):
             return self.task
         return TaskConfig(name=name, attention=self.task.attention)
 
+    @property
+    def suites(self) -> tuple[Suite, ...]:
+        """What every policy version is tried on, the most important suite first."""
+        given = self.evaluator.suites or (SuiteConfig(name=UNLEARNED),)
+        return tuple(map(self._suite, given))
+
+    def suite(self, name: str) -> Suite:
+        """The suite with a name: one of `suites`, or a built-in one.
+
+        Raises:
+            UserError: there is no such suite.
+        """
+        found = {suite.name: suite for suite in self.suites}
+        if name in found:
+            return found[name]
+        if name not in BUILT_IN:
+            known = ", ".join(dict.fromkeys([*found, *BUILT_IN]))
+            raise UserError(f"there is no suite {name!r}; there are: {known}")
+        return self._suite(SuiteConfig(name=name))
+
+    def practised_suites(self) -> tuple[Suite, ...]:
+        """The suites from whose practice seeds actors draw situations."""
+        return tuple(map(self.suite, self.learner.corrections.suites))
+
+    @property
+    def tutoring_backends(self) -> tuple[str, ...]:
+        """Names of the simulators whose actors show cases."""
+        return self.tutor.backends or (self.simulator.backend,)
+
+    def _suite(self, given: SuiteConfig) -> Suite:
+        evaluator, plain = self.evaluator, given.name == UNLEARNED
+        seed = evaluator.seed if plain else first_test_seed(given.name)
+        first = seed if given.seed is None else given.seed
+        practice = given.practice_seed or (None if plain else first_practice_seed(given.name))
+        return Suite(
+            name=given.name,
+            backend=given.backend or self.simulator.backend,
+            test_seeds=range(first, first + (given.trials or evaluator.trials_per_policy)),
+            practice_seeds=(
+                PRACTICE if practice is None else range(practice, practice + PRACTICE_OF_SUITE)
+            ),
+            stretch=given.stretch,
+            disturbances=given.disturbances,
+        )
+
     @model_validator(mode="after")
     def _can_find_failures(self) -> Self:
         corrections = self.learner.corrections
         if corrections.rounds and corrections.choose == "failures" and not self.actor.practice:
             raise ValueError("learner.corrections.choose: failures needs actor.practice")
+        names = {UNLEARNED, *(suite.name for suite in self.suites)}
+        if unknown := set(corrections.suites) - names:
+            raise ValueError(
+                f"learner.corrections.suites: there is no {min(unknown)!r} in evaluator.suites,"
+                f" which has {', '.join(sorted(names))}"
+            )
+        if corrections.suites != (UNLEARNED,) and corrections.choose != "failures":
+            raise ValueError(
+                "learner.corrections.suites needs learner.corrections.choose: failures"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _suites_are_apart(self) -> Self:
+        suites = self.suites
+        for number, suite in enumerate(suites):
+            if suite.test_seeds.stop > TRIALS_BELOW:
+                raise ValueError(
+                    f"evaluator.suites: {suite.name} has test seeds up to"
+                    f" {suite.test_seeds.stop - 1}; they must be below {TRIALS_BELOW}"
+                )
+            for other in suites[:number]:
+                if suite.name == other.name:
+                    raise ValueError(f"evaluator.suites: there are two suites {suite.name!r}")
+                if _overlap(suite.test_seeds, other.test_seeds):
+                    raise ValueError(_overlap_words("test seeds", "seed", suite, other))
+                if _overlap(suite.practice_seeds, other.practice_seeds):
+                    words = ("practice seeds", "practice_seed")
+                    raise ValueError(_overlap_words(*words, suite, other))
         return self
 
     @model_validator(mode="after")
     def _can_be_done(self) -> Self:
-        if (self.done.trials or 0) > self.evaluator.trials_per_policy:
-            raise ValueError("done.trials must not exceed evaluator.trials_per_policy")
+        most = max(len(suite.test_seeds) for suite in self.suites)
+        if (self.done.trials or 0) > most:
+            raise ValueError(
+                "done.trials must not exceed evaluator.trials_per_policy"
+                if self.evaluator.suites is None
+                else f"done.trials must not exceed the {most} trials of the largest suite"
+            )
         return self
 
     def digest(self) -> str:
@@ -517,6 +701,19 @@ class Config(_Section):
         """
         with written_whole(path) as stream:
             stream.write(dump_yaml(self.model_dump(mode="json")).encode())
+
+
+def _overlap(one: range, other: range) -> bool:
+    return one.start < other.stop and other.start < one.stop
+
+
+def _overlap_words(seeds: str, key: str, suite: Suite, other: Suite) -> str:
+    ranges = {
+        each.name: each.test_seeds if key == "seed" else each.practice_seeds
+        for each in (other, suite)
+    }
+    listed = " and ".join(f"{name} {r.start} .. {r.stop - 1}" for name, r in ranges.items())
+    return f"evaluator.suites: the {seeds} of two suites overlap: {listed}; give one another {key}"
 
 
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:

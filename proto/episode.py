@@ -23,6 +23,7 @@ from proto.codec import (
     Text,
     record_of,
 )
+from proto.suites import Conditions, suite_of
 from proto.variables import SituationField
 
 Image = NDArray[np.uint8]
@@ -146,6 +147,10 @@ class View:
     focal_px: Annotated[Floats, Array("float32", (STEPS, 2), 1e-3, 1e6)]
 
 
+ConditionsField = Annotated[Conditions | None, Added(record_of(Conditions))]
+"""Conditions as a field of a message."""
+
+
 @dataclass(frozen=True)
 class Episode:
     """One episode of T control steps.
@@ -182,6 +187,7 @@ class Episode:
             policy from a file.
         started_s: when it was played, Unix time (s); None if this is not known.
         view: what a viewer needs besides; None if this is not known.
+        conditions: the conditions of the suite that it belongs to; None for those of `unlearned`.
     """
 
     id: Id
@@ -214,6 +220,7 @@ class Episode:
     training: Annotated[str, Text(64)] = ""
     started_s: Annotated[float | None, Added(Number(0.0, 1e10))] = None
     view: Annotated[View | None, Added(record_of(View))] = None
+    conditions: ConditionsField = None
 
     def __post_init__(self) -> None:
         """Raise ValueError if a step's phase has no name."""
@@ -221,6 +228,11 @@ class Episode:
             raise ValueError(
                 f"phases: a step is in phase {self.phases.max()} of {len(self.phase_names)}"
             )
+
+    @property
+    def suite(self) -> str:
+        """Name of the suite that it belongs to."""
+        return suite_of(self.conditions)
 
     @property
     def steps(self) -> int:

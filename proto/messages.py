@@ -19,9 +19,20 @@ from proto.codec import (
     message,
     record_of,
 )
-from proto.episode import JOINTS, LARGEST_DEG, Episode, Floats, Id, Image, Kind, Outcome
+from proto.episode import (
+    JOINTS,
+    LARGEST_DEG,
+    ConditionsField,
+    Episode,
+    Floats,
+    Id,
+    Image,
+    Kind,
+    Outcome,
+)
 from proto.keys import Role
 from proto.seeds import SEEDS_PER_CASE
+from proto.suites import Player, suite_of
 from proto.variables import SituationField
 
 EPISODE_LIMIT: Final = 32 * MEBIBYTE
@@ -105,6 +116,7 @@ class EpisodeFailed:
         training: id of the training that the policy comes from, empty for the tutor.
         policy_version: version of the policy, 0 for the tutor.
         problem: why the simulation failed.
+        conditions: as in `Episode`.
     """
 
     id: Id
@@ -116,6 +128,12 @@ class EpisodeFailed:
     training: Annotated[str, Text(64)]
     policy_version: Count
     problem: Annotated[str, Text(1000)]
+    conditions: ConditionsField = None
+
+    @property
+    def suite(self) -> str:
+        """Name of the suite that the episode belongs to."""
+        return suite_of(self.conditions)
 
 
 @message("receipt", 2)
@@ -143,12 +161,14 @@ class TutoringRequest:
         run_id: id of the training that its policy comes from, empty if it has no policy.
         policy_version: version of its policy, 0 if it has none.
         config_digest: digest of the actor's settings, see `proto.agreement`.
+        player: what it can play.
     """
 
     actor: Id
     run_id: Annotated[str, Text(64)]
     policy_version: Count
     config_digest: Annotated[str, Text(64)]
+    player: Player
 
 
 @message("tutoring_case", 2)
@@ -181,14 +201,16 @@ class Correction:
         task: name of the task.
         seed: seed of the episode.
         situation: the situation's values by name.
+        conditions: as in `Episode`.
     """
 
     task: Annotated[str, Text(64)]
     seed: Seed
     situation: SituationField
+    conditions: ConditionsField = None
 
 
-@message("verdict", 2)
+@message("verdict", 3)
 @dataclass(frozen=True)
 class Verdict:
     """Outcome of an episode of practice. The learner chooses corrections where the policy failed.
@@ -200,6 +222,8 @@ class Verdict:
         seed: seed of the episode.
         situation: the situation's values by name.
         outcome: how it ended.
+        backend: name of the simulator that played it.
+        conditions: as in `Episode`.
     """
 
     run_id: Id
@@ -208,6 +232,8 @@ class Verdict:
     seed: Seed
     situation: SituationField
     outcome: Outcome
+    backend: str
+    conditions: ConditionsField = None
 
 
 @message("trial_request", 2)
@@ -219,6 +245,7 @@ class TrialRequest:
     run_id: Id
     policy_version: Count
     config_digest: Annotated[str, Text(64)]
+    player: Player
 
 
 @message("trial", 1)
@@ -228,9 +255,11 @@ class Trial:
 
     Attributes:
         seed: seed of the situation and of the episode.
+        conditions: as in `Episode`.
     """
 
     seed: Seed
+    conditions: ConditionsField = None
 
 
 @dataclass(frozen=True)

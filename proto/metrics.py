@@ -22,6 +22,7 @@ from proto.codec import (
 )
 from proto.episode import Id, Kind
 from proto.keys import Role
+from proto.suites import MOST_SUITES, SuiteName
 
 Count = Annotated[int, Integer(0, 2**53)]
 Rate = Annotated[float, Number(0.0, 1e9)]
@@ -165,13 +166,39 @@ class PolicyScore:
     reasons: Annotated[Mapping[str, int], Table(Integer(0), most=32)]
 
 
-@message("metrics.evaluator", 2, form="json", limit=4 * MEBIBYTE)
+Scores = Annotated[
+    tuple[PolicyScore, ...], Many(record_of(PolicyScore), Size("policies", 0, 10_000, varies=True))
+]
+
+
+@dataclass(frozen=True)
+class SuiteScore:
+    """What was counted in one suite.
+
+    Attributes:
+        name: name of the suite.
+        backend: name of the simulator in which it is played.
+        trials: number of trials that each policy version gets.
+        unplayable: why none of the present actors can play what is still to be tried, such as
+            `no actor has mujoco`; empty if one can.
+        policies: the score of each policy version with counted trials, oldest first.
+    """
+
+    name: SuiteName
+    backend: str
+    trials: Count
+    unplayable: str
+    policies: Scores
+
+
+@message("metrics.evaluator", 2, form="json", limit=16 * MEBIBYTE)
 @dataclass(frozen=True, kw_only=True)
 class EvaluatorMetrics(Metrics):
     """Metrics of the evaluator.
 
     Attributes:
-        policies: the score of each policy version with counted trials, oldest first.
+        policies: the score of each policy version in the first suite, oldest first.
+        suites: what was counted in each suite, in the order of the configuration.
         leases: trials that are being played.
         damaged: lines of the trial log that could not be read and are not counted.
         paused: whether it is paused.
@@ -179,8 +206,9 @@ class EvaluatorMetrics(Metrics):
     """
 
     role: Role = Role.EVALUATOR
-    policies: Annotated[
-        tuple[PolicyScore, ...], Many(record_of(PolicyScore), Size("policies", 0, 10_000))
+    policies: Scores
+    suites: Annotated[
+        tuple[SuiteScore, ...], Many(record_of(SuiteScore), Size("suites", 1, MOST_SUITES))
     ]
     leases: Count
     damaged: Count

@@ -12,7 +12,14 @@ from typing import Any, Final, TypeVar
 from proto.bus import Bus
 from proto.codec import encode
 from proto.keys import Role
-from proto.metrics import METRICS, EvaluatorMetrics, LearnerMetrics, Metrics, PolicyScore
+from proto.metrics import (
+    METRICS,
+    EvaluatorMetrics,
+    LearnerMetrics,
+    Metrics,
+    PolicyScore,
+    SuiteScore,
+)
 
 M = TypeVar("M", bound=Metrics)
 PROCESSES_KEPT: Final = 10_000
@@ -45,9 +52,14 @@ class RunView:
 
     @property
     def scores(self) -> Sequence[PolicyScore]:
-        """Success by policy version in the evaluator's newest metrics, oldest version first."""
+        """Success by policy version in the first suite, oldest version first."""
+        return self.suites[0].policies if self.suites else ()
+
+    @property
+    def suites(self) -> Sequence[SuiteScore]:
+        """What was counted in each suite, in the evaluator's newest metrics."""
         evaluators = [m for m in self.metrics.values() if isinstance(m, EvaluatorMetrics)]
-        return max(evaluators, key=lambda m: m.time_s).policies if evaluators else ()
+        return max(evaluators, key=lambda m: m.time_s).suites if evaluators else ()
 
     @property
     def policy_version(self) -> int:

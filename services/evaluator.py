@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 from typing import Final
 
+from actors.disturbances.staging import check_suite
+from actors.tasks.contract import Task
 from learner.policy_message import policy_of
 from learner.tutoring.failures import Failures
-from proto.acceptance import PlayedTask, misfit, same_situation
+from proto.acceptance import misfit, same_situation
 from proto.agreement import OTHER_SETTINGS, Agreement
 from proto.bus import Bus
 from proto.config import Config
 from proto.disk_waits import when_disk_allows
+from proto.disturbances import DISTURBANCES, Ability
 from proto.episode import Episode, Kind, Outcome
 from proto.errors import UserError
 from proto.keys import Role
@@ -30,10 +34,12 @@ from proto.messages import (
     TrialRequest,
     Verdict,
 )
-from proto.metrics import EvaluatorMetrics, PolicyScore, Success
+from proto.metrics import EvaluatorMetrics, PolicyScore, Success, SuiteScore
 from proto.plain_text import plain
-from proto.seeds import PRACTICE
+from proto.players import Players
+from proto.situations import situation_of
 from proto.storage import make_folder
+from proto.suites import Player, Suite
 from services.trials.asked import AskedTrials, NotYetError
 from services.trials.success import Tally
 from services.trials.trial_log import TrialLog
@@ -49,11 +55,17 @@ VERSIONS_TOLD: Final = 500
 REASONS_TOLD: Final = 31
 """The metrics name so many reasons of a version; the others are summed up."""
 
+TrialKey = tuple[PolicyKey, str, int]
+"""Identifies a trial: the policy, the name of the suite, and the seed."""
+
 
 class Evaluator:
-    """Tries every policy version in the same situations, and counts each trial once."""
+    """Tries every policy version in the same suites, and counts each trial once.
 
-    def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle, *, task: PlayedTask) -> None:
+    It hands out the trials of the first suite first, and to each actor only what it can play.
+    """
+
+    def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle, *, task: Task) -> None:
         """Read the trials that were counted before from the run's folder.
 
         Args:
@@ -63,21 +75,25 @@ class Evaluator:
             task: the task of the run.
 
         Raises:
-            UserError: they cannot be read.
+            UserError: they cannot be read, or a suite cannot be played with the task.
         """
+        for suite in config.suites:
+            check_suite(task, suite)
         self._config = config
         self._bus = bus
         self._lifecycle = lifecycle
         self._log = TrialLog(config.run_folder / "evaluation" / "trials.jsonl")
-        self._leases: Leases[tuple[PolicyKey, int]] = Leases(config.evaluator.lease_s)
-        first = config.evaluator.seed
-        self._seeds = range(first, first + config.evaluator.trials_per_policy)
-        self._failures: Failures[tuple[PolicyKey, int]] = Failures()
+        self._leases: Leases[TrialKey] = Leases(config.evaluator.lease_s)
+        self._suites = {suite.name: suite for suite in config.suites}
+        self._practised = {suite.name: suite for suite in config.practised_suites()}
+        self._players = Players()
+        self._unplayable: dict[str, str] = {}
+        self._failures: Failures[TrialKey] = Failures()
         self._task = task
         self._agreement = Agreement(config, bus)
         self._folder = config.run_folder / "evaluation"
-        self._asked: AskedTrials[int] = AskedTrials(
-            self._log.versions, has_predecessor=self._folder.exists()
+        self._asked: AskedTrials[tuple[str, int]] = AskedTrials(
+            self._log.tried_versions, has_predecessor=self._folder.exists()
         )
 
     def run(self) -> None:
@@ -100,21 +116,20 @@ class Evaluator:
         with membership(self._bus, self, self._lifecycle):
             while not self._lifecycle.stopping:
                 came = rollouts.handle(self._on_rollout, timeout_s=IDLE_S)
-                self._lifecycle.waits_for("" if came else self._missing)
+                self._lifecycle.waits_for("" if came else self._waited_for)
                 while failures.handle(self._on_failure):
                     pass
+                self._look_for_players()
 
     def metrics(self) -> EvaluatorMetrics:
         """Metrics at this moment."""
-        run_id, _ = self._asked.newest
+        suites = tuple(map(self._suite_score, self._suites.values()))
         return EvaluatorMetrics(
             id=self._bus.id,
             time_s=time.time(),
             refused=self._bus.refused,
-            policies=tuple(
-                _score(version, self._counted((run_id, version)).values())
-                for version in self._log.versions(run_id)[-VERSIONS_TOLD:]
-            ),
+            policies=suites[0].policies,
+            suites=suites,
             leases=len(self._leases),
             damaged=self._log.damaged,
             paused=self._lifecycle.paused,
@@ -125,14 +140,35 @@ class Evaluator:
         """Write nothing: each trial is on disk as soon as it is counted."""
         return "every counted trial is on disk"
 
+    def _suite_score(self, suite: Suite) -> SuiteScore:
+        run_id, _ = self._asked.newest
+        return SuiteScore(
+            name=suite.name,
+            backend=suite.backend,
+            trials=len(suite.test_seeds),
+            unplayable=self._unplayable.get(suite.name, ""),
+            policies=tuple(
+                _score(version, self._counted((run_id, version), suite).values())
+                for version in self._log.versions(run_id, suite.name)[-VERSIONS_TOLD:]
+            ),
+        )
+
     @property
     def _done(self) -> bool:
+        """Whether all suites that can be played, and at least one, have the trials."""
         done = self._config.done
         if done.trials is None:
             return done.ever
         newest = self._asked.newest
-        new_enough = newest[1] >= (done.policy_versions or 1)
-        return new_enough and len(self._counted(newest)) >= done.trials
+        if newest[1] < (done.policy_versions or 1):
+            return False
+        counted = {
+            name: len(self._counted(newest, suite)) >= min(done.trials, len(suite.test_seeds))
+            for name, suite in self._suites.items()
+        }
+        return any(counted.values()) and all(
+            enough or name in self._unplayable for name, enough in counted.items()
+        )
 
     def _on_policy(self, policy: PolicyVersion) -> None:
         try:
@@ -144,6 +180,7 @@ class Evaluator:
             LOG.info("policy %d is tried from now on", policy.version)
 
     def _on_presence(self, actor: str, alive: bool) -> None:
+        self._players.presence(actor, alive)
         if not alive:
             self._leases.release(actor)
 
@@ -152,15 +189,49 @@ class Evaluator:
         if request.config_digest != self._agreement.digest:
             self._bus.refuse(f"actor/{request.actor}", OTHER_SETTINGS)
             return None
+        self._players.note(request.actor, request.player)
         if self._lifecycle.paused or (request.run_id, request.policy_version) != newest:
             return None
-        counted = self._counted(newest)
-        wanted = [(newest, seed) for seed in self._seeds if seed not in counted]
-        taken = self._leases.take(request.actor, wanted)
+        taken = self._leases.take(request.actor, self._wanted(newest, request.player))
         if taken is None:
             return None
-        self._asked.give(newest, taken[1], request.actor)
-        return Trial(seed=taken[1])
+        _, name, seed = taken
+        self._asked.give(newest, (name, seed), request.actor)
+        return Trial(seed, self._suites[name].conditions(seed))
+
+    def _wanted(self, policy: PolicyKey, player: Player) -> Iterator[TrialKey]:
+        """The trials of a policy that are not counted yet and that a player can play."""
+        for suite in self._suites.values():
+            for seed in self._missing(policy, suite):
+                if player.can_play(suite.backend, suite.conditions(seed)):
+                    yield policy, suite.name, seed
+
+    def _missing(self, policy: PolicyKey, suite: Suite) -> list[int]:
+        counted = self._counted(policy, suite)
+        return [seed for seed in suite.test_seeds if seed not in counted]
+
+    def _look_for_players(self) -> None:
+        """Note, and log once, which suites have trials that no present actor can play."""
+        unplayable = {}
+        for suite in self._suites.values():
+            problem = self._unplayable_problem(suite)
+            if problem:
+                unplayable[suite.name] = problem
+                if suite.name not in self._unplayable:
+                    LOG.warning("trials of the suite %s are not played: %s", suite.name, problem)
+        self._unplayable = unplayable
+
+    def _unplayable_problem(self, suite: Suite) -> str:
+        """Why no present actor can play a trial of a suite; empty if all can be played."""
+        if not self._missing(self._asked.newest, suite):
+            return ""
+        if self._players.lack(lambda player: player.backend == suite.backend):
+            return f"no actor has {suite.backend}"
+        for name in suite.disturbances:
+            ability = DISTURBANCES[name].ability
+            if self._players.lack(partial(_can_be_disturbed, suite.backend, ability)):
+                return f"no actor with {suite.backend} can play the disturbance {name}"
+        return ""
 
     def _on_rollout(self, rollout: Rollout) -> None:
         episode = rollout.episode
@@ -169,9 +240,10 @@ class Evaluator:
         except NotYetError:  # without a receipt the actor sends it again
             return
         if not refusal and episode.kind is Kind.TRIAL:
-            self._leases.finish(((rollout.run_id, episode.policy_version), episode.seed))
+            policy = (rollout.run_id, episode.policy_version)
+            self._leases.finish((policy, episode.suite, episode.seed))
             if when_disk_allows(self._lifecycle, lambda: self._log.add(rollout)):
-                _report_trial(episode.policy_version, episode.seed, episode.outcome.reason)
+                _report_trial(episode, episode.outcome.reason)
         elif not refusal:
             self._bus.deliver(self._bus.keys.verdict, _verdict(rollout))
         # A trial that was counted before gets its receipt again.
@@ -185,11 +257,12 @@ class Evaluator:
         except NotYetError:
             return
         if not refusal:
-            trial = (report.training, report.policy_version), report.seed
+            policy = (report.training, report.policy_version)
+            trial = (policy, report.suite, report.seed)
             self._leases.finish(trial)
             # Otherwise the trial is handed out again.
             if self._failures.add(trial, report.id) and self._count_failure(report):
-                _report_trial(report.policy_version, report.seed, report.problem)
+                _report_trial(report, report.problem)
         self._answer(report.actor, Receipt(report.id, self._told(report.actor, refusal)))
 
     def _told(self, actor: str, refusal: str) -> str:
@@ -202,14 +275,14 @@ class Evaluator:
         return when_disk_allows(self._lifecycle, lambda: self._log.add_failure(report))
 
     @property
-    def _missing(self) -> str:
+    def _waited_for(self) -> str:
         """What it waits for while no rollout arrives."""
         if self._bus.hub_is_away:
             return "the hub"
         _, version = newest = self._asked.newest
         if not version:
             return "a policy"
-        left = len(self._seeds) - len(self._counted(newest))
+        left = sum(len(self._missing(newest, suite)) for suite in self._suites.values())
         return f"{left} trials of policy {version}" if left else "the next policy"
 
     def _refusal(self, played: Episode | EpisodeFailed) -> str:
@@ -222,27 +295,45 @@ class Evaluator:
             return f"this run tests {self._config.task.name}, not {played.task}"
         if played.kind not in (Kind.TRIAL, Kind.PRACTICE):
             return f"an episode of the kind {played.kind} is not evaluated"
-        if problem := self._seed_problem(played):
-            return problem
+        suite = (self._suites if played.kind is Kind.TRIAL else self._practised).get(played.suite)
+        if suite is None:
+            return f"this run has no suite {played.suite} for an episode of the kind {played.kind}"
+        return (
+            self._seed_problem(played, suite)
+            or self._conditions_problem(played, suite)
+            or self._asked_problem(played, suite)
+        )
+
+    def _seed_problem(self, played: Episode | EpisodeFailed, suite: Suite) -> str:
+        """Why an episode cannot have its seed; empty if it can."""
+        seed = played.seed
+        if played.kind is Kind.TRIAL:
+            known = seed in suite.test_seeds
+            return "" if known else f"no trial with the seed {seed} is asked for"
+        if any(seed in each.test_seeds for each in self._suites.values()):
+            return f"the situation with the seed {seed} is one of trials, not of practice"
+        return "" if seed in suite.practice_seeds else f"the seed {seed} is none of practice"
+
+    def _conditions_problem(self, played: Episode | EpisodeFailed, suite: Suite) -> str:
+        """Why an episode is not what its seed stands for in a suite; empty if it is."""
+        conditions = suite.conditions(played.seed)
+        if played.conditions != conditions:
+            return f"the suite {suite.name} asks for other conditions with the seed {played.seed}"
+        if isinstance(played, Episode) and played.backend != suite.backend:
+            return f"the suite {suite.name} is played in {suite.backend}, not in {played.backend}"
+        if not same_situation(played.situation, situation_of(self._task, conditions, played.seed)):
+            return f"its situation is not the one of the seed {played.seed}"
+        return ""
+
+    def _asked_problem(self, played: Episode | EpisodeFailed, suite: Suite) -> str:
+        """Why an episode was not asked for; empty if it was, or was counted before."""
         policy = (played.training, played.policy_version)
         problem = self._asked.policy_problem(policy)
         if problem or played.kind is Kind.PRACTICE:
             return problem
-        if played.seed in self._counted(policy):
+        if played.seed in self._counted(policy, suite):
             return ""
-        return self._asked.trial_problem(policy, played.seed, played.actor)
-
-    def _seed_problem(self, played: Episode | EpisodeFailed) -> str:
-        """Why an episode cannot have its seed or situation; empty if it can."""
-        if played.kind is Kind.TRIAL and played.seed not in self._seeds:
-            return f"no trial with the seed {played.seed} is asked for"
-        if played.kind is Kind.PRACTICE and played.seed in self._seeds:
-            return f"the situation with the seed {played.seed} is one of trials, not of practice"
-        if played.kind is Kind.PRACTICE and played.seed not in PRACTICE:
-            return f"the seed {played.seed} is none of practice"
-        if not same_situation(played.situation, self._task.sample(played.seed)):
-            return f"its situation is not the one of the seed {played.seed}"
-        return ""
+        return self._asked.trial_problem(policy, (suite.name, played.seed), played.actor)
 
     def _misfit(self, rollout: Rollout) -> str:
         """Why an episode does not fit the configuration of this run; empty if it does."""
@@ -255,13 +346,19 @@ class Evaluator:
     def _answer(self, actor: str, receipt: Receipt) -> None:
         self._bus.deliver(self._bus.keys.receipt(Role.EVALUATOR, actor), receipt)
 
-    def _counted(self, policy: PolicyKey) -> Mapping[int, Outcome]:
-        outcomes = self._log.outcomes(*policy)
-        return {seed: outcome for seed, outcome in outcomes.items() if seed in self._seeds}
+    def _counted(self, policy: PolicyKey, suite: Suite) -> Mapping[int, Outcome]:
+        outcomes = self._log.outcomes(*policy, suite.name)
+        return {seed: outcome for seed, outcome in outcomes.items() if seed in suite.test_seeds}
 
 
-def _report_trial(policy_version: int, seed: int, result: str) -> None:
-    LOG.info("policy %d, trial %d: %s", policy_version, seed, plain(result))
+def _report_trial(played: Episode | EpisodeFailed, result: str) -> None:
+    suite = "" if played.conditions is None else f"{played.suite} "
+    version = played.policy_version
+    LOG.info("policy %d, %strial %d: %s", version, suite, played.seed, plain(result))
+
+
+def _can_be_disturbed(backend: str, ability: Ability | None, player: Player) -> bool:
+    return player.backend == backend and (ability is None or ability in player.abilities)
 
 
 def _verdict(rollout: Rollout) -> Verdict:
@@ -273,6 +370,8 @@ def _verdict(rollout: Rollout) -> Verdict:
         seed=episode.seed,
         situation=episode.situation,
         outcome=episode.outcome,
+        backend=episode.backend,
+        conditions=episode.conditions,
     )
 
 

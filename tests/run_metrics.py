@@ -11,6 +11,7 @@ from proto.metrics import (
     PolicyScore,
     Stage,
     Success,
+    SuiteScore,
 )
 from services.board import RunView
 from services.trials.success import wilson95
@@ -38,9 +39,10 @@ def score(version: int, strict: int, trials: int) -> PolicyScore:
     return PolicyScore(version, trials, success(trials, trials), rate, rate, reasons)
 
 
+SCORES = (score(2, 3, 10), score(3, 44, 52))
 EVALUATOR = EvaluatorMetrics(
-    id="e", time_s=1.0, refused=0, policies=(score(2, 3, 10), score(3, 44, 52)), leases=1,
-    damaged=0, paused=False, done=False,
+    id="e", time_s=1.0, refused=0, policies=SCORES, damaged=0,
+    suites=(SuiteScore("unlearned", "sapien", 52, "", SCORES),), leases=1, paused=False, done=False,
 )  # fmt: skip
 
 

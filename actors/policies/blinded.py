@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from actors.policies.contract import Policy, StatefulPolicy
+from actors.policies.contract import InformedPolicy, Policy, StatefulPolicy
 from actors.tasks.contract import Array, Blinding
 from proto.episode import Image, States
 from proto.errors import UserError
@@ -35,6 +35,11 @@ class BlindedPolicy:
         """Start an episode."""
         self._policy.begin(situation, seed)
         self._step = 0
+
+    def change(self, situation: Situation) -> None:
+        """Tell the policy that the situation has changed, if it can use it."""
+        if isinstance(self._policy, InformedPolicy):
+            self._policy.change(situation)
 
     def step(self, image: Image) -> Array:
         """Return the policy's action (11,) for the changed picture."""

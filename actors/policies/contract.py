@@ -46,3 +46,11 @@ class StatefulPolicy(Policy, Protocol):
         Args:
             images: (T, 48, 64) uint8, the pictures of the episode.
         """
+
+
+@runtime_checkable
+class InformedPolicy(Policy, Protocol):
+    """A policy that knows the situation, such as the tutor, and learns when it changes."""
+
+    def change(self, situation: Situation) -> None:
+        """Take note that an outside hand has changed the situation; called between two steps."""

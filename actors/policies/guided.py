@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.policies.contract import Policy
+from actors.policies.contract import InformedPolicy, Policy
 from proto.body import ACTION_SIZE, FOCUS, GRASP
 from proto.episode import Floats, Image
 from proto.variables import Situation
@@ -56,6 +56,12 @@ class GuidedPolicy:
         """Start an episode for policy and tutor."""
         self._policy.begin(situation, seed)
         self._tutor.begin(situation, seed)
+
+    def change(self, situation: Situation) -> None:
+        """Tell policy and tutor that the situation has changed, if they can use it."""
+        for each in (self._policy, self._tutor):
+            if isinstance(each, InformedPolicy):
+                each.change(situation)
 
     def step(self, image: Image) -> Array:
         """Return the policy's action (11,), clipped to the range around the tutor's action."""

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from actors.motion import execution_noise
+from typing import Final
+
+import numpy as np
+
+from actors.motion import execution_noise, ramp
 from actors.tasks.contract import Array, Belief, Recollection, Task
 from proto.config import TutorConfig
 from proto.episode import Floats, Image
 from proto.variables import Situation
 
+CHANGE_STEPS: Final = 10
+"""Control steps in which it goes over to another plan."""
+
 
 class PlannedPolicy:
-    """A `Policy` that executes the task's plan for the situation that it assumes."""
+    """A `Policy` that executes the task's plan for the situation that it assumes.
+
+    It is an `InformedPolicy`: when the situation changes, it goes over to the plan for what it
+    assumes then.
+    """
 
     version = 0
     looks = False
@@ -47,6 +58,7 @@ class PlannedPolicy:
             seed: seed of the execution noise. The episode before is the one with the next smaller
                 seed, whose situation the task draws; for seed 0 it is the one with seed 1.
         """
+        self._seed = seed
         self._plan = self._task.plan(self._assumed(situation, seed))
         self._actions = self._plan
         if self._noise is not None:
@@ -54,6 +66,14 @@ class PlannedPolicy:
                 len(self._plan), seed, self._noise.noise_deg, self._noise.noise_correlation_steps
             )
         self._step = 0
+
+    def change(self, situation: Situation) -> None:
+        """Go over to the plan for the changed situation within CHANGE_STEPS control steps."""
+        noise = self._actions - self._plan
+        other = self._task.plan(self._assumed(situation, self._seed))
+        share = ramp(len(other), self._step, CHANGE_STEPS)[:, None]
+        self._plan = np.asarray(self._plan + (other - self._plan) * share)
+        self._actions = self._plan + noise
 
     def _assumed(self, situation: Situation, seed: int) -> Situation:
         if isinstance(self._belief, Recollection):

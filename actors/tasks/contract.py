@@ -146,6 +146,14 @@ class Task(ABC):
         figure_words: labels and errors for figures.
         options: names of the task's options in the section `task` of a configuration, besides name
             and attention.
+        pushed_variable: name of the continuous variable, in metres, that changes when the object is
+            pushed; empty if no disturbance can push it. The *object* of a disturbance is the first
+            box of the scene that can move.
+        turned_variable: name of the continuous variable, in degrees, that changes when the object
+            is turned; empty if no disturbance can turn it.
+        disturbed_phase: name of the phase in which a disturbance pushes or turns the object, or
+            knocks the arm: after the object is looked at, and before the hand is near. If empty, it
+            happens in the middle third of an episode.
         attention: `active`, or `fixed`: neck and focus stay as in `start`, whatever the policy
             commands.
     """
@@ -160,6 +168,9 @@ class Task(ABC):
     blinded: ClassVar[Mapping[str, Blinding]] = {}
     figure_words: ClassVar[FigureWords] = FigureWords({})
     options: ClassVar[frozenset[str]] = frozenset()
+    pushed_variable: ClassVar[str] = ""
+    turned_variable: ClassVar[str] = ""
+    disturbed_phase: ClassVar[str] = ""
 
     def __init__(self, config: TaskConfig) -> None:
         """Make the task from the section `task` of a configuration.

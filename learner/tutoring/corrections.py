@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
+from collections.abc import Iterable
 from typing import Protocol
 
 from learner.tutoring.failures import Failures, Shown
@@ -12,7 +13,9 @@ from proto.config import Config
 from proto.episode import Kind
 from proto.leases import Leases
 from proto.messages import Correction, EpisodeFailed, PolicyKey, TutoringRequest, Verdict
-from proto.seeds import CORRECTIONS, PRACTICE, TRIALS_BELOW
+from proto.seeds import CORRECTIONS, TRIALS_BELOW
+from proto.situations import situation_of
+from proto.suites import Player, Suite, suite_of
 from proto.variables import Question, Situation
 
 
@@ -61,6 +64,9 @@ class Round:
         """
         corrections = config.learner.corrections
         self.number = number
+        self._suites = {suite.name: suite for suite in config.practised_suites()}
+        self._tested = tuple(suite.test_seeds for suite in config.suites)
+        self._backends = config.tutoring_backends
         self._task = config.task.name
         self._policy = policy
         self._situations = situations
@@ -102,15 +108,14 @@ class Round:
             ours = (verdict.run_id, verdict.policy_version) == self._policy
             if not ours or verdict.task != self._task or not self._searching:
                 return ""
-            if verdict.seed not in PRACTICE:
-                return f"its seed {verdict.seed} is none of practice"
-            if not same_situation(verdict.situation, self._situations.sample(verdict.seed)):
-                return f"its situation is not the one of the seed {verdict.seed}"
+            if problem := self._practice_problem(verdict):
+                return problem
             self._judged.add(verdict.seed)
             done = self._kept | self._given_up
             if not verdict.outcome.precise and verdict.seed not in done:
-                plan = Correction(verdict.task, verdict.seed, verdict.situation)
-                self._missing[verdict.seed] = plan
+                self._missing[verdict.seed] = Correction(
+                    verdict.task, verdict.seed, verdict.situation, verdict.conditions
+                )
             return ""
 
     def next_correction(self, request: TutoringRequest) -> Correction | None:
@@ -118,8 +123,20 @@ class Round:
         if (request.run_id, request.policy_version) != self._policy:
             return None
         with self._lock:
-            seed = self._leases.take(request.actor, self._missing)
+            playable = (
+                seed for seed, plan in self._missing.items() if self._fits(plan, request.player)
+            )
+            seed = self._leases.take(request.actor, playable)
             return None if seed is None else self._missing[seed]
+
+    def is_played_by(self, player: Player) -> bool:
+        """Whether a player can help with what the round waits for: corrections, or practice."""
+        with self._lock:
+            if any(self._fits(plan, player) for plan in self._missing.values()):
+                return True
+            return self._searching and any(
+                suite.backend == player.backend for suite in self._suites.values()
+            )
 
     def release(self, actor: str) -> None:
         """Hand out again what an actor that vanished was playing."""
@@ -156,13 +173,38 @@ class Round:
             self._given_up.add(report.seed)
             return True
 
+    def _practice_problem(self, verdict: Verdict) -> str:
+        """Why an episode was no practice of a suite that is practised; empty if it was."""
+        suite = self._suites.get(suite_of(verdict.conditions))
+        if suite is None or self._is_tested(verdict.seed) or not _may_be_practised(suite, verdict):
+            return f"its seed {verdict.seed} is none of practice, or its conditions are others"
+        wanted = situation_of(self._situations, verdict.conditions, verdict.seed)
+        if not same_situation(verdict.situation, wanted):
+            return f"its situation is not the one of the seed {verdict.seed}"
+        return ""
+
+    def _is_tested(self, seed: int) -> bool:
+        """Whether a seed is one of a suite's trials; nothing is learned from their situations."""
+        return any(seed in tested for tested in self._tested)
+
+    def _is_practised(self, seed: int) -> bool:
+        return any(seed in suite.practice_seeds for suite in self._suites.values())
+
+    def _fits(self, plan: Correction, player: Player) -> bool:
+        """Whether a player can play a correction, in the world in which the policy failed."""
+        if self._tries:
+            backend = self._suites[suite_of(plan.conditions)].backend
+            return player.can_play(backend, plan.conditions)
+        return player.backend in self._backends
+
     def _lacks(self, shown: Shown) -> bool:
         return (
             self._is_of_policy(shown)
+            and not (self._tries and self._is_tested(shown.seed))
             and shown.seed not in self._kept
             and (
                 shown.seed in self._missing
-                or (self._asked_before and shown.seed in PRACTICE and not self._full)
+                or (self._asked_before and self._is_practised(shown.seed) and not self._full)
             )
         )
 
@@ -182,12 +224,36 @@ class Round:
         return len(self._judged) < self._tries and not self._full
 
 
-def situation_of_correction(seed: int, situations: Situations) -> Situation | None:
-    """The situation that a seed of a correction stands for; None if it is the seed of none."""
-    if seed in CORRECTIONS or seed in PRACTICE:
+def situation_of_correction(
+    shown: Shown, suites: Iterable[Suite], situations: Situations
+) -> Situation | None:
+    """Return the situation that a correction must have; None if it cannot have been asked for.
+
+    Args:
+        shown: the correction.
+        suites: the suites that are practised.
+        situations: situations of the task.
+    """
+    seed, conditions = shown.seed, shown.conditions
+    for suite in suites:
+        if seed in suite.practice_seeds:
+            asked = conditions == suite.conditions(seed)
+            return situation_of(situations, conditions, seed) if asked else None
+    if conditions is not None:
+        return None
+    if seed in CORRECTIONS:
         return situations.sample(seed)
     tutored = situations.tutored() if seed < TRIALS_BELOW else ()
     return tutored[seed] if seed < len(tutored) else None
+
+
+def _may_be_practised(suite: Suite, verdict: Verdict) -> bool:
+    """Whether simulator, seed and conditions of an episode are those of a suite's practice."""
+    return (
+        verdict.backend == suite.backend
+        and verdict.seed in suite.practice_seeds
+        and verdict.conditions == suite.conditions(verdict.seed)
+    )
 
 
 def _chosen(config: Config, number: int, situations: Situations) -> list[Correction]:

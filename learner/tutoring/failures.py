@@ -6,6 +6,7 @@ from collections.abc import Hashable
 from typing import Final, Generic, Protocol, TypeVar
 
 from proto.episode import Kind
+from proto.suites import Conditions
 
 TRIES: Final = 3
 """After so many failed simulations a sequence is not asked for any more."""
@@ -27,6 +28,10 @@ class Shown(Protocol):
     @property
     def seed(self) -> int:
         """Seed of the episode."""
+
+    @property
+    def conditions(self) -> Conditions | None:
+        """The conditions of the suite that it belongs to."""
 
     @property
     def training(self) -> str:

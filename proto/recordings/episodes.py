@@ -22,7 +22,7 @@ import json
 import struct
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -55,6 +55,7 @@ from proto.recordings.schemas import (
     describe,
 )
 from proto.storage import written_whole
+from proto.suites import Conditions
 from proto.variables import Situation
 
 FORMAT: Final = 3
@@ -179,6 +180,7 @@ class EpisodeSummary:
     seed: int
     policy_version: int
     training: str
+    conditions: Conditions | None
     control_period_s: float
     phases: NDArray[np.uint8]
     actions: Floats
@@ -205,6 +207,7 @@ def read_summary(path: Path) -> EpisodeSummary:
             seed=int(texts["seed"]),
             policy_version=int(texts["policy_version"]),
             training=texts.get("training", ""),
+            conditions=_conditions(texts),
             control_period_s=float(texts["control_period_s"]),
             phases=np.array([step.phase - 1 for step in steps], dtype=np.uint8),
             actions=_floats([_action(step.action) for step in steps], shape),
@@ -399,6 +402,7 @@ def _episode(contents: _Contents) -> Episode:
         training=texts.get("training", ""),  # older recordings do not have this field
         started_s=_started_s(texts),
         view=_view(contents, count),
+        conditions=_conditions(texts),
     )
 
 
@@ -432,6 +436,7 @@ def _episode_texts(episode: Episode) -> dict[str, str]:
         "phase_names": json.dumps(episode.phase_names),
         **_states_text(episode),
         **({} if episode.started_s is None else {"started_s": repr(episode.started_s)}),
+        **_conditions_text(episode),
         "outputs": json.dumps(None if episode.outputs is None else episode.outputs.shape[1]),
         "body_names": json.dumps(episode.body_names),
     }
@@ -469,6 +474,25 @@ def _view(contents: _Contents, steps: int) -> View | None:
 def _axes(values: Sequence[Any]) -> tuple[float, float, float]:
     x, y, z = map(float, values)
     return x, y, z
+
+
+def _conditions_text(episode: Episode) -> dict[str, str]:
+    """The conditions as JSON; no entry for those of the suite `unlearned`, as in older files."""
+    if episode.conditions is None:
+        return {}
+    return {"conditions": json.dumps(asdict(episode.conditions))}
+
+
+def _conditions(texts: Mapping[str, str]) -> Conditions | None:
+    if "conditions" not in texts:
+        return None
+    values = json.loads(texts["conditions"])
+    return Conditions(
+        suite=str(values["suite"]),
+        stretch=float(values["stretch"]),
+        disturbance=str(values["disturbance"]),
+        strength=float(values["strength"]),
+    )
 
 
 def _outcome_texts(outcome: Outcome) -> dict[str, str]:

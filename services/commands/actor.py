@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+from functools import partial
 from typing import Final
 
 from actors.actor import Actor
@@ -18,9 +19,13 @@ NICENESS: Final = 10
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_process(parser)
+    parser.add_argument(
+        "--backend",
+        help="this actor's simulator; without it, simulator.backend of the configuration",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Play episodes until the process is stopped."""
     os.nice(NICENESS)
-    return run_process(arguments, Role.ACTOR, Actor)
+    return run_process(arguments, Role.ACTOR, partial(Actor, backend=arguments.backend))

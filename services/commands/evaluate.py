@@ -9,11 +9,13 @@ from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 from actors.tasks.registry import make_task
 from proto.config import Config
 from proto.errors import UserError
 from proto.storage import written_whole
+from proto.suites import Suite
 from proto.variables import parse_situation
 from services.arguments.common import add_config, add_playing, playing_config, positive, seed
 from services.playing.video import write_video
@@ -22,9 +24,12 @@ from services.playing.workers import Job, play_all
 from services.terminal.console import make_console
 from services.terminal.progress import progress_bar
 from services.terminal.tables import success_table
-from services.trials.evaluation import result_json, situation_jobs, trial_jobs
+from services.trials.evaluation import in_world_of, result_json, situation_jobs, trial_jobs
 from services.trials.success import Tally
 from services.trials.trial_log import CountedTrial
+
+TRIALS: Final = range(1000, 1052)
+"""Seeds of the trials without a suite."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -38,9 +43,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
         " checkpoint's file, or a class of your own as package.module:Class; a task may name"
         " blinded policies, such as blank-screen:POLICY",
     )
-    parser.add_argument("--trials", type=positive, default=52, help="number of situations")
     parser.add_argument(
-        "--seed", type=seed, default=1000, help="the same seed gives the same situations"
+        "--suite",
+        help="play the trials of a suite: one of evaluator.suites, or a built-in one such as"
+        " beyond, disturbed or pushed; docs/generalization.md lists them",
+    )
+    parser.add_argument(
+        "--trials",
+        type=positive,
+        help="number of situations; without it, those of the suite, or 52",
+    )
+    parser.add_argument(
+        "--seed",
+        type=seed,
+        help="the same seed gives the same situations; without it, the first test seed of the"
+        " suite, or 1000",
     )
     parser.add_argument(
         "--situation",
@@ -67,7 +84,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Play the trials and print the success rates."""
     config = playing_config(arguments)
-    jobs = _jobs(config, arguments)
+    suite = None if arguments.suite is None else config.suite(arguments.suite)
+    if suite is not None and arguments.backend is None:
+        config = in_world_of(suite, config)
+    jobs = _jobs(config, arguments, suite)
     tally, first = Tally(), None
     trials: list[CountedTrial] = []
     started = time.monotonic()
@@ -80,28 +100,33 @@ def run(arguments: argparse.Namespace) -> int:
             advance()
     if arguments.outcomes is not None:
         _write_outcomes(arguments.outcomes, trials)
-    result = result_json(config, arguments.policy, tally, time.monotonic() - started)
+    result = result_json(config, arguments.policy, tally, time.monotonic() - started, suite)
     if arguments.json:
         print(json.dumps(result))
     else:
-        title = "{policy} on {task} in {backend}, {trials} trials, {wall_s:.1f} s".format(**result)
+        named = "" if suite is None else f", suite {suite.name}"
+        title = "{policy} on {task} in {backend}{named}, {trials} trials, {wall_s:.1f} s"
+        title = title.format(**result, named=named)
         make_console().print(success_table(title, tally))
     if arguments.video is not None and first is not None:
         write_video(first, arguments.video, config)
     return 0
 
 
-def _jobs(config: Config, arguments: argparse.Namespace) -> list[Job]:
+def _jobs(config: Config, arguments: argparse.Namespace, suite: Suite | None) -> list[Job]:
+    plain = TRIALS if suite is None else suite.test_seeds
+    trials = len(plain) if arguments.trials is None else arguments.trials
+    first = plain.start if arguments.seed is None else arguments.seed
     if arguments.states and arguments.out is None:
         raise UserError("--states are recorded in the rollouts; add --out DIR to record rollouts")
     if arguments.situation is None:
-        jobs = trial_jobs(config, arguments.trials, arguments.seed, arguments.out)
+        jobs = trial_jobs(config, trials, first, arguments.out, suite)
     else:
         task = make_task(config.task)
         situations = [
             parse_situation(text, task.variables, task.name) for text in arguments.situation
         ]
-        jobs = situation_jobs(situations, arguments.seed, arguments.out)
+        jobs = situation_jobs(situations, first, arguments.out, suite)
     return [replace(job, states=arguments.states) for job in jobs]
 
 

@@ -12,11 +12,13 @@ import cv2
 import numpy as np
 
 from actors.attention import crop_of_focus
+from actors.disturbances.staging import stage
 from actors.simulator import EYE_HEIGHT, EYE_WIDTH, Crop, Pose, Simulator, make_simulator
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from proto.body import FOCUS
 from proto.config import Config
+from proto.disturbances import DISTURBANCES
 from proto.episode import NO_FAILURE, Episode, Outcome
 from proto.errors import UserError
 from proto.variables import situation_text
@@ -70,7 +72,8 @@ def write_video(
 
 def frames(episode: Episode, simulator: Simulator, task: Task) -> Iterator[Picture]:
     """Yield one picture (480, 1280, 3) uint8, RGB, for each step of an episode of a task."""
-    simulator.reset(task.scene(episode.situation))
+    staging = stage(task, episode.situation, episode.conditions, episode.seed)
+    simulator.reset(staging.scene)
     for step in range(episode.steps):
         poses = _poses(episode, step)
         joints_deg = episode.joints_deg[step].astype(np.float64)
@@ -120,11 +123,20 @@ def _caption(episode: Episode, step: int) -> list[str]:
     if episode.policy_version:
         policy += f" version {episode.policy_version}"
     return [
-        f"{episode.task} in {episode.backend}, {episode.kind} by {policy}",
+        f"{episode.task} in {episode.backend}, {episode.kind} by {policy}{_disturbance(episode)}",
         *wrap(situation_text(episode.situation), _LINE_LETTERS),
         f"step {step + 1} of {episode.steps}, {episode.phase_names[episode.phases[step]]}, "
         f"outcome: {_in_words(episode.outcome)}",
     ]
+
+
+def _disturbance(episode: Episode) -> str:
+    """Such as `, pushed 20 mm`; empty without a disturbance."""
+    conditions = episode.conditions
+    if conditions is None or not conditions.disturbance:
+        return ""
+    unit = DISTURBANCES[conditions.disturbance].unit
+    return f", {conditions.disturbance} {conditions.strength:.3g} {unit}"
 
 
 def _in_words(outcome: Outcome) -> str:

@@ -27,6 +27,7 @@ from proto.config import Config
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.recordings.episodes import write_episode
+from proto.suites import Conditions
 from proto.variables import Situation
 from services.robot_meshes import robot_meshes
 
@@ -42,6 +43,7 @@ class Job:
         noisy: add noise to the tutor's execution; only for the tutor.
         record_to: file to record the episode to, or None.
         states: store the activity of the policy's subnets in the episode; only for networks.
+        conditions: conditions of the suite that it belongs to.
     """
 
     situation: Situation
@@ -50,6 +52,7 @@ class Job:
     noisy: bool = False
     record_to: Path | None = None
     states: bool = False
+    conditions: Conditions | None = None
 
 
 def play_all(
@@ -116,6 +119,7 @@ class _Player:
             seed=job.seed,
             kind=job.kind,
             config_digest=self._digest,
+            conditions=job.conditions,
         )
         if stateful is not None:
             episode = replace(episode, states=stateful.states(episode.images))

@@ -11,7 +11,13 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from proto.metrics import ActorMetrics, LearnerMetrics, PolicyScore, RecorderMetrics
+from proto.metrics import (
+    ActorMetrics,
+    LearnerMetrics,
+    PolicyScore,
+    RecorderMetrics,
+    SuiteScore,
+)
 from proto.plain_text import plain
 from services.board import RunView
 from services.terminal.run_words import actors_words, stage_words, success_words
@@ -27,6 +33,13 @@ def run_tables(view: RunView) -> RenderableType:
     parts.append(_actors_table(view.living(ActorMetrics)))
     if view.scores:
         parts.append(_scores_table(view.scores))
+    if len(view.suites) > 1:
+        parts.append(_suites_table(view.suites))
+    parts += [
+        Text(f"suite {suite.name} is not played: {suite.unplayable}", style="red")
+        for suite in view.suites
+        if suite.unplayable
+    ]
     parts += [
         _text(
             f"recorder {m.id}: {m.episodes} episodes, {m.bytes / 1e6:.1f} MB, {m.dropped} dropped"
@@ -92,11 +105,32 @@ def _outbox_words(actor: ActorMetrics) -> str:
 def _scores_table(scores: Sequence[PolicyScore]) -> Table:
     table = Table("policy", "trials", "lenient", "strict", "precise", "not precise because")
     for score in reversed(scores[-ROWS_SHOWN:]):
-        reasons = sorted(score.reasons.items(), key=lambda item: -item[1])
+        table.add_row(str(score.version), str(score.trials), *_score_cells(score))
+    return table
+
+
+def _suites_table(suites: Sequence[SuiteScore]) -> Table:
+    """The newest policy version that was tried in each suite."""
+    table = Table(
+        *("suite", "simulator", "policy", "trials", "lenient", "strict", "precise"),
+        "not precise because",
+    )
+    for suite in suites:
+        score = suite.policies[-1] if suite.policies else None
         table.add_row(
-            str(score.version),
-            str(score.trials),
-            *(success_words(s, score.trials) for s in (score.lenient, score.strict, score.precise)),
-            _text(", ".join(f"{reason} {count}" for reason, count in reasons if reason != "none")),
+            suite.name,
+            suite.backend,
+            "" if score is None else str(score.version),
+            f"{0 if score is None else score.trials}/{suite.trials}",
+            *(() if score is None else _score_cells(score)),
         )
     return table
+
+
+def _score_cells(score: PolicyScore) -> tuple[str, ...]:
+    """The three readings of success, and the reasons of what was not precise."""
+    reasons = sorted(score.reasons.items(), key=lambda item: -item[1])
+    return (
+        *(success_words(s, score.trials) for s in (score.lenient, score.strict, score.precise)),
+        ", ".join(f"{reason} {count}" for reason, count in reasons if reason != "none"),
+    )

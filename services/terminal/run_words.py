@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from proto.metrics import ActorMetrics, LearnerMetrics, PolicyScore, Stage, Success
+from proto.metrics import ActorMetrics, LearnerMetrics, PolicyScore, Stage, Success, SuiteScore
 from services.board import RunView
 
 
@@ -14,6 +14,7 @@ def run_line(view: RunView) -> str:
         *map(_learner_words, view.living(LearnerMetrics)),
         actors_words(view.living(ActorMetrics)),
         *map(_score_words, view.scores[-1:]),
+        *filter(None, map(_suite_words, view.suites[1:])),
     ]
     if view.vanished_s:
         parts.append("gone: " + ", ".join(f"{role} {name}" for role, name in view.vanished_s))
@@ -58,6 +59,16 @@ def _learner_words(learner: LearnerMetrics) -> str:
         words.append(f"{learner.given_up} given up")
     words.append(f"policy {learner.policy_version}")
     return ", ".join(words)
+
+
+def _suite_words(suite: SuiteScore) -> str:
+    """Such as `beyond strict 8 of 12, 67 % (39 to 86)`; empty if nothing is known of it."""
+    if suite.unplayable:
+        return f"{suite.name} is not played: {suite.unplayable}"
+    if not suite.policies:
+        return ""
+    score = suite.policies[-1]
+    return f"{suite.name} strict {success_words(score.strict, score.trials)}"
 
 
 def _score_words(score: PolicyScore) -> str:

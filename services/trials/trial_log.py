@@ -20,17 +20,20 @@ from proto.codec import (
     record_of,
     schema_of,
 )
-from proto.episode import SIMULATION_FAILED, Episode, Id, Outcome
+from proto.episode import SIMULATION_FAILED, ConditionsField, Episode, Id, Outcome
 from proto.errors import UserError
 from proto.messages import Count, EpisodeFailed, Rollout
 from proto.recordings import format1
 from proto.storage import append_line, drop_unfinished_line
+from proto.suites import UNLEARNED, Conditions, suite_of
 from proto.variables import SituationField
 
 LOG = logging.getLogger(__name__)
 
-FORMAT: Final = 2
-"""Format of the lines that are written; lines of format 1 can be read too."""
+FORMAT: Final = 3
+"""Newest format of lines; lines of format 1 can be read too. Lines of the suite `unlearned` are
+written in format 2, as before there were suites; those of other suites in format 3."""
+_PLAIN_FORMAT: Final = 2
 
 
 @message("counted_trial", 2, form="json")
@@ -47,6 +50,7 @@ class CountedTrial:
         situation: the values of the task's variables by name.
         outcome: how it ended.
         format: format of the line.
+        conditions: as in `proto.episode.Episode`.
     """
 
     run_id: Id
@@ -56,7 +60,13 @@ class CountedTrial:
     actor: Id
     situation: SituationField
     outcome: Outcome
-    format: Annotated[int, Integer(FORMAT, FORMAT)] = FORMAT
+    format: Annotated[int, Integer(_PLAIN_FORMAT, FORMAT)] = _PLAIN_FORMAT
+    conditions: ConditionsField = None
+
+    @property
+    def suite(self) -> str:
+        """Name of the suite that it belongs to."""
+        return suite_of(self.conditions)
 
     @classmethod
     def of(cls, episode: Episode, run_id: str) -> CountedTrial:
@@ -69,11 +79,17 @@ class CountedTrial:
             actor=episode.actor,
             situation=episode.situation,
             outcome=episode.outcome,
+            format=_format_with(episode.conditions),
+            conditions=episode.conditions,
         )
 
     def line(self) -> bytes:
         """Return the line of JSON, with a line break at its end."""
         return encode(self).payload + b"\n"
+
+
+def _format_with(conditions: Conditions | None) -> int:
+    return _PLAIN_FORMAT if conditions is None else FORMAT
 
 
 def read_trials(path: Path) -> list[CountedTrial]:
@@ -96,7 +112,7 @@ def read_trials(path: Path) -> list[CountedTrial]:
 
 
 def _parse_line(line: bytes) -> CountedTrial:
-    """Parse a line of format 1 or 2.
+    """Parse a line of format 1, 2 or 3.
 
     Raises:
         MessageError: the line is not a counted trial, or its format is newer.
@@ -108,7 +124,7 @@ def _parse_line(line: bytes) -> CountedTrial:
         if number == 1:
             outcome = format1.outcome_of(values["outcome"])
             values["outcome"] = record_of(Outcome).pack(outcome)
-            values["format"] = FORMAT
+            values["format"] = _PLAIN_FORMAT
             line = json.dumps(values).encode()
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise MessageError("payload", f"is not a counted trial: {error!r:.128}") from error
@@ -135,7 +151,7 @@ class TrialLog:
         """
         self._path = path
         self.damaged = 0
-        self._outcomes: dict[tuple[str, int], dict[int, Outcome]] = defaultdict(dict)
+        self._outcomes: dict[tuple[str, int, str], dict[int, Outcome]] = defaultdict(dict)
         if drop_unfinished_line(path):
             LOG.warning("%s: dropped its last line, which was not finished", path)
         content = path.read_bytes() if path.exists() else b""
@@ -164,26 +180,34 @@ class TrialLog:
                 actor=report.actor,
                 situation=report.situation,
                 outcome=SIMULATION_FAILED,
+                format=_format_with(report.conditions),
+                conditions=report.conditions,
             )
         )
 
-    def versions(self, run_id: str) -> list[int]:
-        """Return the policy versions of a training with counted trials, oldest first."""
+    def versions(self, run_id: str, suite: str = UNLEARNED) -> list[int]:
+        """Return the policy versions of a training with counted trials in a suite, oldest first."""
         keys = list(self._outcomes)  # a copy, because another thread may add to it
-        return sorted(version for run, version in keys if run == run_id)
+        return sorted(version for run, version, name in keys if (run, name) == (run_id, suite))
 
-    def outcomes(self, run_id: str, policy_version: int) -> Mapping[int, Outcome]:
-        """Return the outcomes of a policy version by the trial's seed."""
-        return dict(self._outcomes.get((run_id, policy_version), {}))
+    def tried_versions(self, run_id: str) -> list[int]:
+        """Return the policy versions of a training with trials in any suite, oldest first."""
+        return sorted({version for run, version, _ in list(self._outcomes) if run == run_id})
+
+    def outcomes(
+        self, run_id: str, policy_version: int, suite: str = UNLEARNED
+    ) -> Mapping[int, Outcome]:
+        """Return the outcomes of a policy version in a suite by the trial's seed."""
+        return dict(self._outcomes.get((run_id, policy_version, suite), {}))
 
     def _add(self, trial: CountedTrial) -> bool:
-        if trial.seed in self.outcomes(trial.run_id, trial.policy_version):
+        if trial.seed in self.outcomes(trial.run_id, trial.policy_version, trial.suite):
             return False
         append_line(self._path, trial.line())
         return self._count(trial)
 
     def _count(self, trial: CountedTrial) -> bool:
-        outcomes = self._outcomes[trial.run_id, trial.policy_version]
+        outcomes = self._outcomes[trial.run_id, trial.policy_version, trial.suite]
         new = trial.seed not in outcomes
         outcomes.setdefault(trial.seed, trial.outcome)
         return new

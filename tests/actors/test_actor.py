@@ -29,6 +29,7 @@ from proto.config import (
     TaskConfig,
     load_config,
 )
+from proto.disturbances import Ability
 from proto.episode import Episode, Kind
 from proto.keys import Keys, Role
 from proto.messages import (
@@ -51,9 +52,11 @@ from proto.metrics import ActorMetrics
 from proto.outbox import IN_FLIGHT, Outbox
 from proto.run_locks import own_id
 from proto.seeds import PRACTICE
+from proto.suites import Conditions, Player
 
 MakeEpisode = Callable[..., Episode]
 TASK = make_task(TaskConfig())
+SAPIEN = Player("sapien", tuple(sorted(Ability)))
 
 
 @pytest.fixture(scope="module")
@@ -400,17 +403,39 @@ def test_a_failed_simulation_is_reported_to_learner_and_evaluator(
     setup.publish(policy(4))
     eventually(lambda: setup.holds("training", 4), "it holds it")
     setup.cases.append(Correction("experiment1", 3, situation))
-    setup.trials.append(Trial(seed=80))
+    setup.trials.append(Trial(80, Conditions("noisy", 1.0, "noisy", 9.0)))
     eventually(lambda: len(setup.failures) == 3, "a correction and a trial fail")
     by_kind = {report.kind: report for report in setup.failures}
     assert by_kind[Kind.CORRECTION].seed == 3
     assert by_kind[Kind.TRIAL].seed == 80
+    assert by_kind[Kind.TRIAL].conditions == Conditions("noisy", 1.0, "noisy", 9.0)
     for kind in (Kind.CORRECTION, Kind.TRIAL):
         assert (by_kind[kind].training, by_kind[kind].policy_version) == ("training", 4)
     metrics = setup.wait_for_metrics(lambda metrics: metrics.outbox == 0 and metrics.failed == 3)
     assert metrics.episodes == 1
     assert [episode.seed for episode in setup.sequences] == [5000]
     assert setup.actor.poll() is None
+
+
+def test_it_plays_trials_and_practises_under_the_conditions_of_suites(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    conditions = Conditions("pushed", 1.0, "pushed", 20.0)
+    unknown = Conditions("mine", 1.0, "darker", 20.0)
+    setup.trials += [Trial(500, conditions), Trial(501, unknown)]
+    setup.publish(policy(1))
+    suites = "evaluator.suites=[{name: pushed, trials: 5}, {name: elsewhere, backend: other}]"
+    corrections = "learner.corrections={rounds: 1, suites: [pushed, elsewhere]}"
+    setup.start_actor("--set", suites, "--set", corrections)
+    eventually(lambda: len(setup.rollouts) >= 3, "two trials, then practice")
+    trial, mine, practice = (rollout.episode for rollout in setup.rollouts[:3])
+    assert (trial.kind, trial.seed, trial.conditions) == (Kind.TRIAL, 500, conditions)
+    assert (mine.kind, mine.seed, mine.conditions) == (Kind.TRIAL, 501, unknown)
+    assert dict(trial.situation) == dict(TASK.sample(500))
+    suite = load_config(None, [suites]).suite("pushed")
+    assert practice.kind is Kind.PRACTICE
+    assert practice.seed in suite.practice_seeds
+    assert practice.conditions == suite.conditions(practice.seed)
 
 
 def test_nothing_is_lost_while_there_is_no_hub(

@@ -16,7 +16,7 @@ import pytest
 from ports import free_endpoint
 from processes import eventually
 
-from deploy.run_local import DEFAULT_CONFIG, main, programs
+from deploy.run_local import DEFAULT_CONFIG, actors_of, check_actors, main, programs
 from proto.config import Config, LearnerConfig, load_config
 from proto.run_locks import owned_run
 
@@ -157,12 +157,65 @@ def test_every_config_is_valid_and_can_be_done(config: Path) -> None:
 
 def test_threads_and_actors_follow_the_config() -> None:
     config = Config(learner=LearnerConfig(threads=3))
-    by_name = {program.name: program for program in programs(config, Path("config.yaml"), 5)}
+    actors = {"sapien": 5}
+    by_name = {program.name: program for program in programs(config, Path("config.yaml"), actors)}
     assert next(iter(by_name)) == "hub", "all others need it"
     assert by_name["learner"].threads == 3
     assert by_name["actor"].threads == 1
     assert by_name["actor"].processes == 5
-    assert "actor" not in {p.name for p in programs(config, Path("config.yaml"), 0)}
+    assert "--backend" not in by_name["actor"].command
+    none = programs(config, Path("config.yaml"), {"sapien": 0})
+    assert "actor" not in {program.name for program in none}
+
+
+def test_actors_of_several_simulators_are_programs_of_their_own() -> None:
+    actors = {"sapien": 2, "my.own:Still": 1, "elsewhere": 0}
+    started = {program.name: program for program in programs(Config(), Path("c.yaml"), actors)}
+    assert [name for name in started if name.startswith("actor")] == [
+        *("actor-sapien", "actor-my-own-Still"),
+    ]
+    assert started["actor-sapien"].processes == 2
+    assert "--backend" not in started["actor-sapien"].command
+    assert started["actor-my-own-Still"].command[-2:] == ("--backend", "my.own:Still")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            ["--set", "evaluator.suites=[unlearned, {name: m, backend: other}]"],
+            "no actor has the simulator other of the suite m; start one with --actors"
+            " sapien=1,other=1, or write 0",
+        ),
+        (
+            ["--set", "tutor.backends=[other]", "--actors", "2"],
+            "no actor has the simulator other of tutor.backends",
+        ),
+        (["--actors", "other=2"], "no actor has the simulator sapien of the suite unlearned"),
+        (["--set", "evaluator.suites=[unlearned, {name: a, disturbances: {pusht: 1}}]"], "pusht"),
+        (["--set", "evaluator.suites=[beyond, beyond]"], "two suites"),
+    ],
+)
+def test_a_suite_that_no_actor_can_play_starts_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+) -> None:
+    assert main(["--set", f"run.folder={tmp_path}", *arguments]) == 2
+    assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("text", ["sapien", "sapien=x", "sapien=1,sapien=2", "=3", "a=1,2", "-1"])
+def test_wrong_numbers_of_actors_are_refused(text: str) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([f"--actors={text}"])
+    assert ended.value.code == 2
+
+
+def test_actors_from_elsewhere_are_believed() -> None:
+    config = load_config(None, ["evaluator.suites=[unlearned, {name: m, backend: other}]"])
+    check_actors(actors_of({"sapien": 1, "other": 0}, config), config)
+    check_actors(actors_of(0, config), config)
+    assert actors_of(3, config) == {"sapien": 3}
 
 
 def test_a_run_that_is_being_played_is_not_touched_by_a_second_start(

@@ -44,6 +44,7 @@ from proto.messages import (
 )
 from proto.metrics import LearnerMetrics, Stage
 from proto.recordings.episodes import read_episode, write_episode
+from proto.suites import Player
 
 MakeEpisode = Callable[..., Episode]
 SETTINGS = {
@@ -61,6 +62,7 @@ SETTINGS = {
 
 
 FAILED = NOT_LIFTED
+SAPIEN = Player("sapien")
 
 
 def case(number: int, repeat: int, task: str = "experiment1") -> TutoringCase:
@@ -103,9 +105,8 @@ class LearnerSetup:
     def ask(self) -> list[TutoringCase | Correction]:
         """Send a request as an actor that has the newest policy."""
         newest = [(policy.run_id, policy.version) for policy in self.policies[-1:]]
-        request = TutoringRequest(
-            "actor", *(newest[0] if newest else ("", 0)), settings_digest(*self.settings)
-        )
+        policy = newest[0] if newest else ("", 0)
+        request = TutoringRequest("actor", *policy, settings_digest(*self.settings), SAPIEN)
         key = self.actor.keys.request_tutoring
         answers: list[TutoringCase | Correction]
         answers = self.actor.ask(key, request, TutoringCase, Correction)
@@ -138,6 +139,7 @@ class LearnerSetup:
         """Report a failure of practice until the learner requests a correction there."""
         task, newest = make_task(TaskConfig()), self.policies[-1]
         policy = {"run_id": newest.run_id, "policy_version": newest.version, "task": task.name}
+        policy["backend"] = "sapien"
         verdict = Verdict(seed=seed, situation=task.sample(seed), outcome=FAILED, **policy)
         asked: list[TutoringCase | Correction] = []
 

@@ -29,8 +29,10 @@ from proto.messages import (
     TutoringCase,
     TutoringRequest,
 )
+from proto.suites import Player
 
 KEYS = Keys("test")
+SAPIEN = Player("sapien")
 
 
 class Network:
@@ -180,14 +182,14 @@ def test_a_query_is_answered_with_a_message_or_with_nothing(shared: Network) -> 
     learner.answer(KEYS.request_tutoring, TutoringRequest, hand_out)
 
     def ask(name: str) -> list[TutoringCase]:
-        return actor.ask(KEYS.request_tutoring, TutoringRequest(name, "", 0), TutoringCase)
+        return actor.ask(KEYS.request_tutoring, TutoringRequest(name, "", 0, SAPIEN), TutoringCase)
 
     eventually(
         lambda: ask("fail") == [] and ask("asking") == [TutoringCase("experiment1", 3, 1)],
         "an answer",
     )
     assert ask("asking") == []
-    assert actor.ask(KEYS.request_tutoring, TrialRequest("a", "b", 1), TutoringCase) == []
+    assert actor.ask(KEYS.request_tutoring, TrialRequest("a", "b", 1, SAPIEN), TutoringCase) == []
     assert learner.refused == 1
 
 
@@ -196,7 +198,7 @@ def test_a_query_without_receiver_returns_at_once_without_answers(shared: Networ
     answers: list[list[TutoringCase]] = []
 
     def ask() -> None:
-        request = TutoringRequest("lonely", "", 0)
+        request = TutoringRequest("lonely", "", 0, SAPIEN)
         answers.append(actor.ask("vmdnn/test/nobody", request, TutoringCase, timeout_s=30.0))
 
     thread = threading.Thread(target=ask, daemon=True)
@@ -229,7 +231,7 @@ def test_everything_reconnects_after_the_hub_was_killed() -> None:
         presence: list[tuple[str, bool]] = []
 
         def answers() -> list[TutoringCase]:
-            question = TutoringRequest("actor", "", 0)
+            question = TutoringRequest("actor", "", 0, SAPIEN)
             return actor.ask(KEYS.request_tutoring, question, TutoringCase)
 
         actor.announce()

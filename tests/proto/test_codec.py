@@ -38,7 +38,8 @@ from proto.messages import (
     TrialRequest,
     TutoringCase,
 )
-from proto.metrics import METRICS, ActorMetrics, EvaluatorMetrics, PolicyScore, Success
+from proto.metrics import METRICS, ActorMetrics, EvaluatorMetrics, PolicyScore, Success, SuiteScore
+from proto.suites import MOST_STRETCH, Conditions, Player
 
 MakeEpisode = Callable[..., Episode]
 
@@ -47,11 +48,17 @@ WORDS = st.text(st.characters(categories=("L", "N", "P", "Zs")), max_size=40).fi
     str.isprintable
 )
 COUNTS = st.integers(0, 2**31)
+PLAYERS = st.builds(Player, WORDS, st.lists(WORDS, max_size=4).map(tuple))
+CONDITIONS = st.one_of(
+    st.none(),
+    st.builds(Conditions, IDS, st.floats(1, MOST_STRETCH)),
+    st.builds(Conditions, IDS, st.just(1.0), st.just("pushed"), st.floats(10, 30)),
+)
 MESSAGES = st.one_of(
     st.builds(Receipt, IDS),
     st.builds(TutoringCase, WORDS, COUNTS, COUNTS),
-    st.builds(TrialRequest, IDS, IDS, COUNTS, WORDS),
-    st.builds(Trial, st.integers(0, 2**63 - 1)),
+    st.builds(TrialRequest, IDS, IDS, COUNTS, WORDS, PLAYERS),
+    st.builds(Trial, st.integers(0, 2**63 - 1), CONDITIONS),
     st.builds(Control, st.sampled_from(Command)),
     st.builds(
         PolicyVersion,
@@ -118,6 +125,16 @@ def test_states_are_decoded_unchanged_and_missing_states_are_not_sent(sequence: 
     assert "states" in msgpack.unpackb(encode(sent).payload)["episode"]
     assert "states" not in msgpack.unpackb(encode(sequence).payload)["episode"]
     assert decode(encode(sequence), Sequence).episode.states is None
+
+
+def test_conditions_are_decoded_unchanged_and_missing_conditions_are_not_sent(
+    sequence: Sequence,
+) -> None:
+    conditions = Conditions("disturbed", 1.2, "noisy", 7.5)
+    sent = Sequence(replace(sequence.episode, conditions=conditions))
+    assert decode(encode(sent), Sequence).episode.conditions == conditions
+    assert "conditions" not in msgpack.unpackb(encode(sequence).payload)["episode"]
+    assert decode(encode(sequence), Sequence).episode.suite == "unlearned"
 
 
 def test_a_live_step_is_decoded_unchanged() -> None:
@@ -270,11 +287,13 @@ def test_a_message_that_is_too_large_is_refused_before_it_is_read() -> None:
 
 def test_metrics_are_plain_json() -> None:
     rate = Success(3, 0.75, (0.3, 0.95))
+    scores = (PolicyScore(2, 4, rate, rate, rate, {"not_lifted": 1}),)
     sent = EvaluatorMetrics(
         id="evaluator",
         time_s=1.5,
         refused=0,
-        policies=(PolicyScore(2, 4, rate, rate, rate, {"not_lifted": 1}),),
+        policies=scores,
+        suites=(SuiteScore("unlearned", "sapien", 52, "", scores),),
         leases=1,
         damaged=0,
         paused=False,

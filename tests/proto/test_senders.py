@@ -39,10 +39,10 @@ def test_what_is_read_as_a_sender_is_a_role_and_an_id(text: str) -> None:
 @pytest.mark.parametrize(
     ("message", "key", "sender", "problem"),
     [
-        (Receipt("e"), KEYS.receipt("a"), LEARNER, ""),
-        (Receipt("e"), KEYS.receipt("a"), EVALUATOR, ""),
-        (Receipt("e"), KEYS.receipt("a"), ACTOR, "not actor/x"),
-        (Receipt("e"), KEYS.receipt("a"), None, "without a name"),
+        (Receipt("e"), KEYS.receipt(Role.LEARNER, "a"), LEARNER, ""),
+        (Receipt("e"), KEYS.receipt(Role.LEARNER, "a"), EVALUATOR, ""),
+        (Receipt("e"), KEYS.receipt(Role.LEARNER, "a"), ACTOR, "not actor/x"),
+        (Receipt("e"), KEYS.receipt(Role.LEARNER, "a"), None, "without a name"),
         (VERDICT, KEYS.verdict, EVALUATOR, ""),
         (VERDICT, KEYS.verdict, LEARNER, "only evaluator"),
         (make_policy(1), KEYS.policy, LEARNER, ""),
@@ -80,15 +80,19 @@ def test_strangers_publish_no_policies_and_give_no_receipts(
     receipts: list[tuple[Receipt, Sender]] = []
     actor.subscribe_newest(KEYS.policy, policies.append, PolicyVersion)
     actor.subscribe_with_sender(
-        KEYS.receipt("a"), lambda receipt, sender: receipts.append((receipt, sender)), Receipt
+        KEYS.receipt(Role.LEARNER, "a"),
+        lambda receipt, sender: receipts.append((receipt, sender)),
+        Receipt,
     )
     for bus in (stranger, learner):
-        eventually(lambda bus=bus: bus.watched(KEYS.receipt("a")), "the actor listens")
+        eventually(
+            lambda bus=bus: bus.watched(KEYS.receipt(Role.LEARNER, "a")), "the actor listens"
+        )
     stranger.publish_newest(KEYS.policy, make_policy(9))
-    stranger.deliver(KEYS.receipt("a"), Receipt("forged"))
+    stranger.deliver(KEYS.receipt(Role.LEARNER, "a"), Receipt("forged"))
     eventually(lambda: actor.refused == 2, "both are refused")
     learner.publish_newest(KEYS.policy, make_policy(1))
-    learner.deliver(KEYS.receipt("a"), Receipt("true"))
+    learner.deliver(KEYS.receipt(Role.LEARNER, "a"), Receipt("true"))
     eventually(lambda: bool(policies and receipts), "those of the learner arrive")
     assert [policy.version for policy in policies] == [1]
     assert receipts == [(Receipt("true"), Sender(Role.LEARNER, "l"))]
@@ -102,10 +106,10 @@ def test_strangers_publish_no_policies_and_give_no_receipts(
 
 def test_a_fault_in_handling_a_message_ends_nothing(joined: Callable[[Role, str], Bus]) -> None:
     reader, learner = joined(Role.ACTOR, "a"), joined(Role.LEARNER, "l")
-    inbox = reader.inbox(KEYS.receipt("a"), Receipt, capacity=8)
-    eventually(lambda: learner.watched(KEYS.receipt("a")), "the actor listens")
+    inbox = reader.inbox(KEYS.receipt(Role.LEARNER, "a"), Receipt, capacity=8)
+    eventually(lambda: learner.watched(KEYS.receipt(Role.LEARNER, "a")), "the actor listens")
     for name in ("bad", "good"):
-        learner.deliver(KEYS.receipt("a"), Receipt(name))
+        learner.deliver(KEYS.receipt(Role.LEARNER, "a"), Receipt(name))
     seen = []
 
     def handle(receipt: Receipt) -> None:

@@ -17,6 +17,7 @@ from processes import PATIENCE_S, eventually, listening_hub, run_vmdnn, stop, vm
 
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig
+from proto.disturbances import Ability
 from proto.episode import Episode, Kind, Outcome
 from proto.keys import Role
 from proto.messages import (
@@ -31,11 +32,13 @@ from proto.messages import (
     Verdict,
 )
 from proto.metrics import EvaluatorMetrics
+from proto.suites import Conditions, Player
 from services.evaluator import _reasons
 from services.trials.success import Tally
 
 TASK = task_called("experiment1")
 MakeEpisode = Callable[..., Episode]
+SAPIEN = Player("sapien")
 
 
 class EvaluatorSetup:
@@ -63,10 +66,15 @@ class EvaluatorSetup:
         self.learner.subscribe(self.learner.keys.verdict, self.verdicts.append, Verdict)
         self.process = self.start()
 
-    def start(self) -> Popen[bytes]:
+    def start(self, *more: str) -> Popen[bytes]:
         self.metrics = None
-        self.process = self._stack.enter_context(vmdnn("evaluator", *self.words))
+        self.process = self._stack.enter_context(vmdnn("evaluator", *self.words, *more))
         return self.process
+
+    def restart(self, *more: str) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.start(*more)
 
     def join(self, role: Role, name: str) -> Bus:
         bus = open_bus(HubConfig(endpoint=self.endpoint), "test", role, name)
@@ -76,8 +84,10 @@ class EvaluatorSetup:
         policy = make_policy(version, run_id)
         self.learner.publish_newest(self.learner.keys.policy, policy)
 
-    def ask(self, actor: Bus, version: int, run_id: str = "training") -> list[int]:
-        request = TrialRequest(actor.id, run_id, version, settings_digest())
+    def ask(
+        self, actor: Bus, version: int, run_id: str = "training", player: Player = SAPIEN
+    ) -> list[int]:
+        request = TrialRequest(actor.id, run_id, version, settings_digest(), player)
         key = actor.keys.request_trial
         given = actor.ask(
             key, request, Trial, timeout_s=PATIENCE_S
@@ -341,6 +351,82 @@ def test_a_paused_evaluator_counts_but_assigns_no_trials(setup: EvaluatorSetup) 
     assert setup.ask(actor, 1) == [71]
     actor.ask(control, Control(Command.STOP), ControlReply)
     assert setup.process.wait(30) == 0
+
+
+SUITES = (
+    "evaluator.suites=[{name: unlearned, trials: 1}, {name: pushed, trials: 2, seed: 500},"
+    " {name: elsewhere, trials: 1, seed: 600, backend: other}]"
+)
+
+
+def counts_by_suite(metrics: EvaluatorMetrics) -> dict[str, int]:
+    return {suite.name: sum(score.trials for score in suite.policies) for suite in metrics.suites}
+
+
+def test_each_actor_gets_trials_of_the_suites_that_it_can_play(setup: EvaluatorSetup) -> None:
+    setup.restart("--set", SUITES, "--set", "done.trials=2")
+    actor, other = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "b")
+    able, plain, foreign = Player("sapien", (Ability.SHOVES,)), SAPIEN, Player("other")
+    setup.publish(2)
+    assert setup.ask_until_given(actor, 2) == 70
+    setup.wait_for_metrics(lambda metrics: metrics.leases == 1)
+    assert setup.ask(actor, 2, player=plain) == [], "it cannot push"
+    (trial,) = actor.ask(
+        actor.keys.request_trial, TrialRequest("a", "training", 2, able), Trial, timeout_s=60.0
+    )
+    assert trial == Trial(500, trial.conditions)
+    assert trial.conditions is not None
+    assert (trial.conditions.suite, trial.conditions.disturbance) == ("pushed", "pushed")
+    assert setup.ask(other, 2, player=foreign) == [600]
+
+    setup.send(actor, 70, 2)
+    played = {"conditions": trial.conditions}
+    weaker = replace(trial.conditions, strength=trial.conditions.strength / 2 + 5)
+    assert "other conditions" in setup.refused(actor, 500, 2, id="w", conditions=weaker)
+    assert "no suite" in setup.refused(actor, 500, 2, id="x", conditions=Conditions("beyond"))
+    assert "no trial with the seed 71" in setup.refused(actor, 71, 2, id="y", **played)
+    here = {"conditions": Conditions("elsewhere"), "id": "z"}
+    assert "played in other, not in sapien" in setup.refused(actor, 600, 2, **here)
+    setup.send(actor, 500, 2, outcome=NOT_LIFTED, **played)
+    practice = {"kind": Kind.PRACTICE, "id": "p", "outcome": NOT_LIFTED}
+    assert "one of trials" in setup.refused(actor, 501, 2, **practice)
+    metrics = setup.wait_for_metrics(lambda metrics: counts_by_suite(metrics)["pushed"] == 1)
+    assert counts_by_suite(metrics) == {"unlearned": 1, "pushed": 1, "elsewhere": 0}
+    assert counts(metrics) == {2: 1}, "the first suite"
+    assert [(suite.trials, suite.backend) for suite in metrics.suites] == [
+        *((1, "sapien"), (2, "sapien"), (1, "other")),
+    ]
+
+
+def test_a_suite_that_no_actor_can_play_is_told_and_not_waited_for(setup: EvaluatorSetup) -> None:
+    setup.restart("--set", SUITES, "--set", "done.trials=2")
+    actor = setup.join(Role.ACTOR, "a")
+    setup.publish(2)
+    assert setup.ask_until_given(actor, 2) == 70
+    setup.send(actor, 70, 2)
+
+    def told(metrics: EvaluatorMetrics) -> bool:
+        return all(suite.unplayable for suite in metrics.suites[1:])
+
+    metrics = setup.wait_for_metrics(told)
+    assert [suite.unplayable for suite in metrics.suites] == [
+        "",
+        "no actor with sapien can play the disturbance pushed",
+        "no actor has other",
+    ]
+    setup.wait_for_metrics(lambda metrics: metrics.done)
+    setup.ask(actor, 2, player=Player("other"))
+    metrics = setup.wait_for_metrics(lambda metrics: not metrics.suites[2].unplayable)
+    assert not metrics.done, "now it can be waited for"
+
+
+def test_a_suite_that_the_task_cannot_be_played_with_is_bad_input(tmp_path: Path) -> None:
+    words = ("--set", f"run.folder={tmp_path}", "--set", "evaluator.suites=[unlearned, pushed]")
+    with listening_hub(endpoint := free_endpoint()):
+        own = ("--set", "task.name=tests.plain_task:PlainTask")
+        ended = run_vmdnn("evaluator", "--connect", endpoint, *words, *own)
+    assert ended.returncode == 2
+    assert "cannot be played with the disturbance 'pushed'" in ended.stderr
 
 
 def test_a_second_evaluator_of_the_same_folder_is_refused(setup: EvaluatorSetup) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.backends import robot
-from actors.simulator import ROBOT, Array, Bodies, Box, Pose, Scene
+from actors.simulator import ROBOT, Array, Bodies, Box, Pose, Scene, Shove
 from sim_assets.icub import ROOT, Capsule, Collider, Cuboid, IcubModel
 
 LOG = logging.getLogger(__name__)
@@ -119,6 +119,8 @@ class World:
             _add_box(spec, box)
         _add_contacts(spec, skin, scene.boxes)
         self._model = spec.compile()
+        for name, factor in scene.damping.items():
+            self._model.actuator(name).biasprm[2] *= factor
         self._data = mujoco.MjData(self._model)
         self._angles = np.array([self._model.joint(name).qposadr[0] for name in builder.joints])
         self._boxes = {box.name: self._model.body(box.name).id for box in scene.boxes}
@@ -135,6 +137,22 @@ class World:
     def drive(self, targets_rad: Array) -> None:
         """Set the target angles (J,) of all joints."""
         self._data.ctrl[:] = targets_rad
+
+    def push_joints(self, torques_nm: Mapping[str, float]) -> None:
+        """Let outside torques act on joints, by name, until this is called again."""
+        self._data.qfrc_applied[:] = 0.0
+        for name, torque_nm in torques_nm.items():
+            self._data.qfrc_applied[self._model.joint(name).dofadr] = torque_nm
+
+    def shove(self, shove: Shove, share: float) -> None:
+        """Move a box by a share of a shove, from where it is, and stop it."""
+        body = self._boxes[shove.box]
+        x, y, z = self._data.xpos[body].tolist()
+        w, i, j, k = self._data.xquat[body].tolist()
+        self._put_box(body, shove.moved(Pose((x, y, z), (w, i, j, k)), share))
+        start = self._model.jnt_dofadr[self._model.body_jntadr[body]]
+        self._data.qvel[start : start + 6] = 0.0
+        mujoco.mj_step1(self._model, self._data)
 
     def step(self) -> None:
         """Run one physics step.

@@ -21,6 +21,7 @@ from actors.backends.sapien import graphics
 from actors.backends.sapien.renderer import Renderer
 from actors.backends.sapien.world import RobotBuilder, World
 from actors.simulator import (
+    UNTURNED,
     Array,
     Bodies,
     Crop,
@@ -33,6 +34,7 @@ from actors.simulator import (
     StepReport,
 )
 from proto.config import SimulatorConfig
+from proto.disturbances import Ability
 from sim_assets.icub import EYE
 from sim_assets.icub_visuals import Visual
 
@@ -44,6 +46,7 @@ class SapienSimulator:
     """
 
     name = "sapien"
+    abilities = frozenset(Ability)
 
     def __init__(self, config: SimulatorConfig) -> None:
         """Make the simulator.
@@ -101,9 +104,14 @@ class SapienSimulator:
             raise ValueError(f"joint targets must be finite, got {after}")
         ramp_deg = motor_ramp_deg(before, after, self._config.substeps)
         world = self._world
+        if self._scene.knocks:
+            world.push_joints(self._scene.torques_nm(self._step))
+        shoves = self._scene.shoves_at(self._step)
         touches: set[tuple[str, str]] = set()
         for joints_rad in joints_from_motors_rad(ramp_deg):
             world.drive(joints_rad)
+            for shove in shoves:
+                world.shove(shove, 1 / self._config.substeps)
             world.step()
             touches.update(world.touches())
         self._targets_deg = after
@@ -190,7 +198,10 @@ class SapienSimulator:
         poses = self._world.poses()
         self._eye_renderer.place(poses, self._step)
         focal = eye.eye_focal_lengths(crop, width, height)
-        return self._eye_renderer.picture(poses[EYE], width, height, focal)
+        place = poses[EYE]
+        if self._scene.eye_turn != UNTURNED:
+            place = place * sapien.Pose(q=self._scene.eye_turn)
+        return self._eye_renderer.picture(place, width, height, focal)
 
     def _make_renderer(self, robot: tuple[Visual, ...]) -> Renderer:
         renderer = Renderer(robot)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -12,7 +13,7 @@ from sapien import physx
 from sapien.wrapper.urdf_loader import URDFLoader
 
 from actors.backends import robot
-from actors.simulator import ROBOT, Array, Bodies, Box, Pose, Scene
+from actors.simulator import ROBOT, Array, Bodies, Box, Pose, Scene, Shove
 from sim_assets.icub import Capsule, Collider, Cuboid, IcubModel
 
 POSITION_ITERATIONS: Final = 12
@@ -38,15 +39,23 @@ class RobotBuilder:
             links[collider.link].collision_groups = _ROBOT_GROUPS
             _add_collider(links[collider.link], collider, material)
 
-    def build(self, scene: sapien.Scene, height_m: float) -> Any:
-        """Put the robot into a scene, its root link `height_m` above the origin."""
+    def build(self, scene: sapien.Scene, height_m: float, damping: Mapping[str, float]) -> Any:
+        """Put the robot into a scene.
+
+        Args:
+            scene: the scene.
+            height_m: height of its root link above the origin.
+            damping: by joint, the factor of the damping of its drive.
+        """
         self._builder.set_scene(scene)
         self._builder.set_initial_pose(sapien.Pose([0.0, 0.0, height_m], robot.ROOT_QUATERNION))
         articulation = self._builder.build(fix_root_link=True)
         for link in articulation.links:
             link.disable_gravity = True  # as if the robot's controller compensated for it
         for name in self._joints:
-            _set_drive(articulation.find_joint_by_name(name), robot.drive_of(name))
+            drive = robot.drive_of(name)
+            drive = replace(drive, damping=drive.damping * damping.get(name, 1.0))
+            _set_drive(articulation.find_joint_by_name(name), drive)
         return articulation
 
 
@@ -98,8 +107,8 @@ class World:
         self._scene = sapien.Scene([physx.PhysxCpuSystem()])
         self._system = self._scene.physx_system
         self._system.timestep = period_s
-        self._robot = builder.build(self._scene, scene.table_drop_m)
-        order = [joint.name for joint in self._robot.active_joints]
+        self._robot = builder.build(self._scene, scene.table_drop_m, scene.damping)
+        self._order = order = [joint.name for joint in self._robot.active_joints]
         self._drives = [self._robot.find_joint_by_name(name) for name in joints]
         # Position of each of PhysX's joints among the model's, and the other way round.
         self._model_rows = np.array([joints.index(name) for name in order])
@@ -118,6 +127,22 @@ class World:
         """Set the target angles (J,) of all joints."""
         for joint, target in zip(self._drives, targets_rad.tolist(), strict=True):
             joint.set_drive_target(target)
+
+    def push_joints(self, torques_nm: Mapping[str, float]) -> None:
+        """Let outside torques act on joints, by name, until this is called again."""
+        forces = np.zeros(len(self._model_rows), dtype=np.float32)
+        for joint, torque_nm in torques_nm.items():
+            forces[self._order.index(joint)] = torque_nm
+        self._robot.set_qf(forces)
+
+    def shove(self, shove: Shove, share: float) -> None:
+        """Move a box by a share of a shove, from where it is, and stop it."""
+        body = self._bodies[shove.box]
+        now = body.entity.get_pose()
+        pose = shove.moved(Pose(tuple(now.p.tolist()), tuple(now.q.tolist())), share)
+        body.entity.set_pose(sapien.Pose(pose.position_m, pose.quaternion))
+        body.set_linear_velocity([0.0, 0.0, 0.0])
+        body.set_angular_velocity([0.0, 0.0, 0.0])
 
     def step(self) -> None:
         """Run one physics step."""

@@ -35,6 +35,9 @@ class Experiment1(Task):
     questions = (Question("object_y_m", 3), Question("object_yaw_deg", 5))
     baselines = BASELINES
     figure_words = FIGURE_WORDS
+    pushed_variable = "object_y_m"
+    turned_variable = "object_yaw_deg"
+    disturbed_phase = "reach above object"
 
     def tutored(self) -> Sequence[Situation]:
         """Return all situations of the grid, 45 in Experiment I."""

@@ -63,6 +63,9 @@ class Experiment2(Task):
     blinded = BLINDED
     figure_words = FIGURE_WORDS
     options = OPTIONS
+    pushed_variable = "indicated_y_m"
+    turned_variable = "indicated_yaw_deg"
+    disturbed_phase = "reach above object"
 
     def __init__(self, config: TaskConfig) -> None:
         """Make the task as the configuration's section `task` says.

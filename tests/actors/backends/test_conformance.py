@@ -27,14 +27,18 @@ from actors.simulator import (
     Box,
     Crop,
     JointTargets,
+    Knock,
     Pose,
     Scene,
     Screen,
+    Shove,
     Simulator,
+    abilities_of,
     load_backend,
     make_simulator,
 )
 from proto.config import SimulatorConfig
+from proto.disturbances import Ability
 from sim_assets.hand import motors_from_grasp
 
 ARM = (-30.0, 30.0, 30.0, 60.0, -30.0, -30.0, 10.0)
@@ -257,6 +261,110 @@ def rotation(quaternion):
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+# --- disturbances -----------------------------------------------------------------------------
+
+
+def needs(simulator, ability):
+    if ability not in abilities_of(simulator):
+        pytest.skip(f"{simulator.name} does not say that it can play {ability}")
+
+
+def played(simulator, disturbed, steps=16):
+    """Measured joints after each step of an episode in which nothing is to move."""
+    simulator.reset(disturbed)
+    rows = []
+    for _ in range(steps):
+        simulator.step(disturbed.start)
+        rows.append(simulator.joints_deg())
+    return np.array(rows)
+
+
+def test_abilities_are_known(blind):
+    assert abilities_of(blind) <= set(Ability)
+
+
+def test_a_shove_moves_and_turns_a_box_within_its_step_and_leaves_it_at_rest(blind):
+    needs(blind, Ability.SHOVES)
+    shove = Shove("object", 4, (-0.01, 0.03), 20.0)
+    blind.reset(replace(scene(), shoves=(shove,)))
+    poses = []
+    for _ in range(9):
+        blind.step(targets())
+        poses.append(blind.bodies()["object"])
+    x, y, z = OBJECT.pose.position_m
+    for before in poses[:4]:
+        assert before.position_m == pytest.approx((x, y, z), abs=1e-3)
+    half = np.deg2rad(20.0) / 2
+    for after in poses[4:]:
+        assert after.position_m == pytest.approx((x - 0.01, y + 0.03, z), abs=1.5e-3)
+        assert after.quaternion == pytest.approx((np.cos(half), 0, 0, np.sin(half)), abs=5e-3)
+
+
+def test_a_knock_turns_its_joint_while_it_lasts(blind):
+    """The drive holds against the torque: 400 Nm/rad at the arm's joints."""
+    needs(blind, Ability.KNOCKS)
+    plain = played(blind, scene(TABLE))
+    for sign in (1.0, -1.0):
+        knock = Knock("r_elbow", sign * 20.0, 3, 3)
+        turned = played(blind, replace(scene(TABLE), knocks=(knock,))) - plain
+        elbow = 2 + 3
+        assert turned[:3] == pytest.approx(0.0, abs=0.02)
+        expected = sign * np.rad2deg(20.0 / 400.0) * (1 - math.exp(-3))
+        assert turned[5, elbow] == pytest.approx(expected, rel=0.1)
+        assert turned[14, elbow] == pytest.approx(0.0, abs=0.05)
+        rest_of_the_arm = np.delete(turned, elbow, axis=1)[:, 2:8]
+        assert np.abs(rest_of_the_arm).max() < 0.2 * abs(expected)
+
+
+def test_more_damping_lets_a_joint_lag(blind):
+    needs(blind, Ability.DAMPING)
+    goal, roll = targets(arm=moved_roll(20.0)), 3
+    lags = []
+    for damping in ({}, {"r_shoulder_roll": 2.0}, {"r_elbow": 2.0}):
+        blind.reset(replace(scene(TABLE), damping=damping))
+        run(blind, 5, goal)
+        lags.append(ARM[1] + 20.0 - blind.joints_deg()[roll])
+    plain, damped, other = lags
+    assert damped == pytest.approx(2 * plain, rel=0.2)
+    assert other == pytest.approx(plain, rel=0.05)
+
+
+def test_a_turned_eye_sees_what_lies_in_that_direction(seeing):
+    """Turned to the left, it sees the same as an eye that the neck has turned to the left."""
+    needs(seeing, Ability.EYE_TURN)
+    start = targets(neck=(-38.0, -10.0))
+    seeing.reset(scene(start=start))
+    straight = seeing.observe(Crop()).image.astype(float)
+    half = np.deg2rad(3.0) / 2
+    moved = {}
+    for name, axis in (("left", (0.0, 0.0, 1.0)), ("up", (0.0, -1.0, 0.0)), ("roll", (1.0, 0, 0))):
+        turn = (math.cos(half), *(math.sin(half) * value for value in axis))
+        seeing.reset(replace(scene(start=start), eye_turn=turn))
+        moved[name] = seeing.observe(Crop()).image.astype(float)
+        assert np.abs(moved[name] - straight).mean() > 0.5
+    pixels = round(3.0 / 50.0 * 48)
+    shifted = np.abs(moved["left"][:, pixels:] - straight[:, :-pixels]).mean()
+    assert shifted < 0.6 * np.abs(moved["left"][:, pixels:] - straight[:, pixels:]).mean()
+    shifted = np.abs(moved["up"][pixels:] - straight[:-pixels]).mean()
+    assert shifted < 0.6 * np.abs(moved["up"][pixels:] - straight[pixels:]).mean()
+    seeing.reset(scene(start=start))
+    assert np.array_equal(seeing.observe(Crop()).image, straight)
+
+
+def test_after_a_disturbed_episode_a_plain_one_is_as_before(blind):
+    plain = played(blind, scene())
+    able = abilities_of(blind)
+    disturbances = {
+        Ability.SHOVES: {"shoves": (Shove("object", 2, (0.0, 0.02), 10.0),)},
+        Ability.KNOCKS: {"knocks": (Knock("r_elbow", 30.0, 13, 3),)},
+        Ability.DAMPING: {"damping": {"r_elbow": 3.0}},
+        Ability.EYE_TURN: {"eye_turn": (math.cos(0.01), math.sin(0.01), 0.0, 0.0)},
+    }
+    given = {key: value for each in able for key, value in disturbances[each].items()}
+    played(blind, replace(scene(), **given))
+    assert np.array_equal(played(blind, scene()), plain)
 
 
 # --- repeatability ----------------------------------------------------------------------------

@@ -13,14 +13,17 @@ from actors.tasks.registry import make_task
 from learner.tutoring.corrections import Round
 from learner.tutoring.failures import TRIES
 from proto.config import Config, TaskConfig
+from proto.disturbances import Ability
 from proto.episode import Episode, Kind, Outcome
 from proto.messages import Correction, EpisodeFailed, TutoringRequest, Verdict
 from proto.seeds import CORRECTIONS, PRACTICE
+from proto.suites import Player, Suite
 
 MakeEpisode = Callable[..., Episode]
 TASK = make_task(TaskConfig())
 POLICY = ("training", 7)
 P = PRACTICE.start
+SAPIEN = Player("sapien")
 
 
 def make_round(
@@ -35,7 +38,7 @@ def make_round(
 
 
 def ask(round_: Round, actor: str = "actor", policy: tuple[str, int] = POLICY) -> Correction | None:
-    return round_.next_correction(TutoringRequest(actor, *policy, "digest"))
+    return round_.next_correction(TutoringRequest(actor, *policy, "digest", SAPIEN))
 
 
 def ask_all(round_: Round) -> list[Correction]:
@@ -47,6 +50,7 @@ def ask_all(round_: Round) -> list[Correction]:
 
 def verdict(seed: int, outcome: Outcome = IMPRECISE, **given: Any) -> Verdict:
     values = {"run_id": "training", "policy_version": 7, "task": "experiment1", **given}
+    values.setdefault("backend", "sapien")
     return Verdict(seed=seed, situation=TASK.sample(seed), outcome=outcome, **values)
 
 
@@ -249,3 +253,70 @@ def test_the_failure_of_an_actor_that_was_not_asked_is_ignored(
     for attempt in range(2 * TRIES):
         assert not round_.fail(failure(f"{attempt}", actor="stranger", **policy))
     assert ask(round_, "b") != ask(round_, "c"), "the first situation is still leased"
+
+
+DISTURBED = {
+    "evaluator": {"suites": ["unlearned", "disturbed", {"name": "elsewhere", "backend": "other"}]},
+    "learner": {
+        "corrections": {
+            "rounds": 1,
+            "sequences": 9,
+            "tries": 20,
+            "suites": ["disturbed", "elsewhere"],
+        }
+    },
+}
+ABLE = Player("sapien", tuple(Ability))
+
+
+def of_suite(suite: Suite, seed: int, **given: Any) -> Verdict:
+    values = {"backend": suite.backend, "conditions": suite.conditions(seed), **given}
+    return verdict(seed, **values)
+
+
+def test_failures_of_named_suites_are_corrected_under_their_conditions() -> None:
+    config = Config.model_validate(DISTURBED)
+    round_ = Round(config, 1, POLICY, TASK)
+    disturbed, elsewhere = config.suite("disturbed"), config.suite("elsewhere")
+    pushed = next(
+        seed
+        for seed in disturbed.practice_seeds
+        if (drawn := disturbed.conditions(seed)) and drawn.disturbance == "pushed"
+    )
+    other = elsewhere.practice_seeds[7]
+    round_.judge(of_suite(disturbed, pushed))
+    round_.judge(of_suite(elsewhere, other))
+    assert round_.judged == 2
+
+    def asked_by(player: Player) -> Correction | None:
+        return round_.next_correction(TutoringRequest("actor", *POLICY, player))
+
+    assert asked_by(SAPIEN) is None, "its simulator cannot push an object"
+    assert not round_.is_played_by(Player("third"))
+    assert asked_by(ABLE) == Correction(
+        "experiment1", pushed, TASK.sample(pushed), disturbed.conditions(pushed)
+    )
+    correction = asked_by(Player("other"))
+    assert correction is not None
+    assert (correction.seed, correction.conditions) == (other, elsewhere.conditions(other))
+
+
+def test_no_trial_is_ever_corrected(correction: Callable[..., Episode]) -> None:
+    config = Config.model_validate(DISTURBED)
+    round_ = Round(config, 1, POLICY, TASK)
+    disturbed = config.suite("disturbed")
+    tested = [seed for suite in config.suites for seed in suite.test_seeds]
+    for seed in tested:
+        round_.judge(of_suite(disturbed, seed))
+        round_.judge(verdict(seed))
+        assert not round_.wants(correction(seed))
+    practised = disturbed.practice_seeds[0]
+    for wrong in (
+        {"conditions": None},
+        {"conditions": config.suite("beyond").conditions(practised)},
+        {"backend": "other"},
+    ):
+        round_.judge(of_suite(disturbed, practised, **wrong))
+    round_.judge(of_suite(disturbed, config.suite("elsewhere").practice_seeds[0]))
+    assert round_.judged == 0
+    assert round_.next_correction(TutoringRequest("actor", *POLICY, ABLE)) is None

@@ -21,6 +21,7 @@ from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
 from proto.episode import NO_FAILURE, BoxLook, Episode, Kind, Measure, Outcome, View
 from proto.errors import UserError
 from proto.recordings.episodes import EpisodeSummary, read_episode, read_summary, write_episode
+from proto.suites import Conditions
 from sim_assets.hand import MOTOR_NAMES
 
 OUTPUTS = 110
@@ -29,6 +30,14 @@ FORMAT_1 = Path(__file__).parents[2] / "data" / "format1"
 
 
 MakeEpisode = Callable[..., Episode]
+
+
+def conditions() -> st.SearchStrategy[Conditions | None]:
+    strength = st.floats(10, 30)
+    pushed = st.builds(
+        Conditions, st.text(max_size=8), st.floats(1, 3), st.just("pushed"), strength
+    )
+    return st.none() | pushed
 
 
 def floats(*shape: int) -> st.SearchStrategy[np.ndarray]:
@@ -89,6 +98,7 @@ def episodes(draw: st.DrawFn) -> Episode:
         training=draw(word),
         started_s=draw(st.none() | st.floats(0.0, 1e10)),
         view=draw(st.none() | views(steps)),
+        conditions=draw(conditions()),
     )
 
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 from rich.console import Console
-from run_metrics import ACTOR, EVALUATOR, LEARNER, RUN, view_of
+from run_metrics import ACTOR, EVALUATOR, LEARNER, RUN, score, view_of
 
 from proto.keys import Role
-from proto.metrics import Stage
+from proto.metrics import Stage, SuiteScore
 from services.board import RunView
 from services.terminal.run_tables import run_tables
 from services.terminal.run_words import run_line
@@ -48,6 +48,19 @@ def test_one_line_summarizes_the_run() -> None:
         "learner coupled, epoch 120/2500, loss 0.4321, 45 sequences, 12.5 epochs/s, policy 3"
         " | 1 actor, 81 steps/s, 17 episodes | policy 3 strict 44 of 52, 85 % (72 to 92)"
     )
+
+
+def test_several_suites_are_shown_beside_each_other() -> None:
+    beyond = SuiteScore("beyond", "sapien", 40, "", (score(2, 1, 10), score(3, 30, 40)))
+    elsewhere = SuiteScore("elsewhere", "other", 40, "no actor has other", ())
+    several = replace(EVALUATOR, suites=(*EVALUATOR.suites, beyond, elsewhere))
+    text = shown(view_of(several))
+    for expected in ("unlearned", "52/52", "40/40", "30 of 40, 75 %", "0/40"):
+        assert expected in text
+    assert "suite elsewhere is not played: no actor has other" in text
+    line = run_line(view_of(several))
+    assert "| policy 3 strict 44 of 52, 85 % (72 to 92) | beyond strict 30 of 40, 75 %" in line
+    assert line.endswith("| elsewhere is not played: no actor has other")
 
 
 @pytest.mark.parametrize(

@@ -58,6 +58,34 @@ def test_without_json_it_prints_a_table(capsys: pytest.CaptureFixture[str]) -> N
     assert "evaluating tutor" in printed.err
 
 
+def test_a_suite_is_played_without_the_bus(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    outcomes = tmp_path / "o.jsonl"
+    words = f"--policy tutor --suite pushed --trials 2 --outcomes {outcomes}".split()
+    result = evaluate(capsys, *words)
+    assert (result["suite"], result["trials"], result["precise"]["successes"]) == ("pushed", 2, 2)
+    suite = Config().suite("pushed")
+    trials = read_trials(outcomes)
+    assert [trial.seed for trial in trials] == list(suite.test_seeds[:2])
+    assert [trial.conditions for trial in trials] == [
+        suite.conditions(seed) for seed in suite.test_seeds[:2]
+    ]
+
+
+def test_a_suite_of_the_configuration_has_its_own_trials(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    suites = "evaluator.suites=[{name: far, trials: 1, seed: 7, stretch: 1.1}]"
+    result = evaluate(capsys, "--policy", "replay", "--suite", "far", "--set", suites)
+    assert (result["suite"], result["trials"]) == ("far", 1)
+
+
+def test_an_unknown_suite_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "--policy", "tutor", "--suite", "pusht"]) == 2
+    assert "there is no suite 'pusht'; there are: unlearned, beyond" in capsys.readouterr().err
+
+
 def test_rollouts_are_recorded_in_the_situations_of_the_seed(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

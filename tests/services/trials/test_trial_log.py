@@ -12,6 +12,7 @@ from outcomes import PRECISE, measures
 from proto.episode import Episode, Kind
 from proto.errors import UserError
 from proto.messages import Rollout
+from proto.suites import Conditions
 from services.trials.trial_log import TrialLog, read_trials
 
 MakeEpisode = Callable[..., Episode]
@@ -42,6 +43,30 @@ def test_a_trial_counts_once_for_each_policy(tmp_path: Path, trial: Callable[...
         assert known.outcomes("another", 7) == {}
     assert not again.add(trial(6))
     assert len(path.read_text().splitlines()) == 4
+
+
+def test_each_suite_is_counted_on_its_own_and_plain_lines_stay_as_they_were(
+    tmp_path: Path, trial: Callable[..., Rollout]
+) -> None:
+    path = tmp_path / "trials.jsonl"
+    log = TrialLog(path)
+    plain = trial(5)
+    pushed = replace(
+        plain,
+        episode=replace(plain.episode, conditions=Conditions("disturbed", 1.0, "pushed", 20.0)),
+    )
+    assert [log.add(each) for each in (plain, pushed, pushed)] == [True, True, False]
+    again = TrialLog(path)
+    for known in (log, again):
+        assert sorted(known.outcomes("run", 1)) == sorted(known.outcomes("run", 1, "disturbed"))
+        assert known.versions("run", "disturbed") == [1]
+        assert known.versions("run", "beyond") == []
+    first, second = read_trials(path)
+    assert (first.suite, first.format, second.suite, second.format) == (
+        *("unlearned", 2, "disturbed", 3),
+    )
+    assert second.conditions == pushed.episode.conditions
+    assert b"conditions" not in path.read_bytes().splitlines()[0]
 
 
 @pytest.mark.parametrize("kept", [1, 40, -1])
@@ -89,6 +114,6 @@ def test_lines_of_a_newer_format_are_reported(
 ) -> None:
     path = tmp_path / "trials.jsonl"
     TrialLog(path).add(trial(5))
-    path.write_text(path.read_text().replace('"format": 2', '"format": 3'))
-    with pytest.raises(UserError, match="3 was written by a newer vmdnn"):
+    path.write_text(path.read_text().replace('"format": 2', '"format": 4'))
+    with pytest.raises(UserError, match="4 was written by a newer vmdnn"):
         read_trials(path)
