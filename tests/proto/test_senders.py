@@ -22,7 +22,7 @@ from proto.messages import PolicyVersion, Receipt, Rollout, Verdict
 from proto.senders import Sender, is_id, origin_problem
 
 KEYS = Keys("test")
-VERDICT = Verdict("t", 1, "experiment1", 2**30, {"object_y_m": 0.25}, NOT_LIFTED)
+VERDICT = Verdict("t", 1, "experiment1", 2**30, {"object_y_m": 0.25}, NOT_LIFTED, "sapien")
 LEARNER, EVALUATOR, ACTOR = (
     Sender(role, "x") for role in (Role.LEARNER, Role.EVALUATOR, Role.ACTOR)
 )
