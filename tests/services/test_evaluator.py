@@ -209,7 +209,7 @@ def test_nothing_counts_that_was_not_asked_for(setup: EvaluatorSetup) -> None:
     actor, stranger = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "s")
     setup.publish(1)
     assert setup.ask_until_given(actor, 1) == 70
-    request = TrialRequest("s", "training", 1, settings_digest("task.attention=fixed"))
+    request = TrialRequest("s", "training", 1, settings_digest("task.attention=fixed"), SAPIEN)
     assert stranger.ask(stranger.keys.request_trial, request, Trial) == []
     for name, wrong, problem in (
         ("no-lease", {}, "was not asked of s"),
@@ -372,7 +372,10 @@ def test_each_actor_gets_trials_of_the_suites_that_it_can_play(setup: EvaluatorS
     setup.wait_for_metrics(lambda metrics: metrics.leases == 1)
     assert setup.ask(actor, 2, player=plain) == [], "it cannot push"
     (trial,) = actor.ask(
-        actor.keys.request_trial, TrialRequest("a", "training", 2, able), Trial, timeout_s=60.0
+        actor.keys.request_trial,
+        TrialRequest("a", "training", 2, settings_digest(), able),
+        Trial,
+        timeout_s=60.0,
     )
     assert trial == Trial(500, trial.conditions)
     assert trial.conditions is not None

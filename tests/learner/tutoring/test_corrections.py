@@ -289,7 +289,7 @@ def test_failures_of_named_suites_are_corrected_under_their_conditions() -> None
     assert round_.judged == 2
 
     def asked_by(player: Player) -> Correction | None:
-        return round_.next_correction(TutoringRequest("actor", *POLICY, player))
+        return round_.next_correction(TutoringRequest("actor", *POLICY, "digest", player))
 
     assert asked_by(SAPIEN) is None, "its simulator cannot push an object"
     assert not round_.is_played_by(Player("third"))
@@ -319,4 +319,4 @@ def test_no_trial_is_ever_corrected(correction: Callable[..., Episode]) -> None:
         round_.judge(of_suite(disturbed, practised, **wrong))
     round_.judge(of_suite(disturbed, config.suite("elsewhere").practice_seeds[0]))
     assert round_.judged == 0
-    assert round_.next_correction(TutoringRequest("actor", *POLICY, ABLE)) is None
+    assert round_.next_correction(TutoringRequest("actor", *POLICY, "digest", ABLE)) is None
