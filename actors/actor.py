@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from actors.disturbances.staging import check_abilities, stage
+from actors.disturbances.staging import check_abilities, check_staged, stage
 from actors.inquiry import Inquiry
 from actors.left_outboxes import LOOK_EVERY_S, OUTBOXES, LeftOutboxes
 from actors.player import LiveStep, play
@@ -427,6 +427,7 @@ class Actor:
                 disturbed as the conditions say.
         """
         check_abilities(self._simulator, conditions)
+        check_staged(task, situation, conditions)
         stage(task, situation, conditions, seed)
 
     def _play(self, assignment: Assignment) -> Episode:

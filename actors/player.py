@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.attention import clip_action, crop_of_focus, targets_of_action, with_attention_of
-from actors.disturbances.staging import check_abilities, stage
+from actors.disturbances.staging import check_abilities, check_staged, stage
 from actors.policies.contract import InformedPolicy, Policy
 from actors.simulator import Simulator
 from actors.tasks.contract import Task
@@ -81,6 +81,7 @@ def play(
             as the conditions say.
     """
     check_abilities(simulator, conditions)
+    check_staged(task, situation, conditions)
     staging = stage(task, situation, conditions, seed)
     started_s = time.time()
     simulator.reset(staging.scene)

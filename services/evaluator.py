@@ -259,7 +259,8 @@ class Evaluator:
         if not refusal:
             policy = (report.training, report.policy_version)
             trial = (policy, report.suite, report.seed)
-            self._leases.finish(trial)
+            if not self._failures.counts(trial, report.id):  # the trial may be played again now
+                self._leases.finish(trial)
             # Otherwise the trial is handed out again.
             if self._failures.add(trial, report.id) and self._count_failure(report):
                 _report_trial(report, report.problem)

@@ -57,9 +57,8 @@ def stage(task: Task, situation: Situation, conditions: Conditions | None, seed:
         seed: seed of the episode, which decides about everything that the disturbance draws.
 
     Raises:
-        UserError: the situation is not one of the task, or the task cannot be disturbed so.
+        UserError: the task cannot be disturbed so, or the scene cannot be made.
     """
-    _check(task, situation, conditions)
     scene = task.scene(situation)
     plain = Staging(scene, situation, None, _as_it_is)
     if conditions is None or not conditions.disturbance:
@@ -104,7 +103,14 @@ def check_abilities(simulator: Simulator, conditions: Conditions | None) -> None
         )
 
 
-def _check(task: Task, situation: Situation, conditions: Conditions | None) -> None:
+def check_staged(task: Task, situation: Situation, conditions: Conditions | None) -> None:
+    """Check that a situation is one of a task, in the ranges that it has under conditions.
+
+    A recorded episode can be shown without that: the task may have had other options.
+
+    Raises:
+        UserError: it is none.
+    """
     if conditions is None or conditions.stretch == 1.0:
         task.check(situation)
         return

@@ -164,6 +164,8 @@ class Round:
         with self._lock:
             if not self._is_of_policy(report) or report.seed not in self._missing:
                 return False
+            if self._failures.counts(report.seed, report.id):
+                return False
             if self._leases.holder(report.seed) != report.actor:
                 return False
             self._leases.finish(report.seed)

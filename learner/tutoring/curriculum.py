@@ -94,6 +94,8 @@ class Curriculum:
             if not self._lacks(report):
                 return False
             key = _key(report)
+            if self._failures.counts(key, report.id):
+                return False
             if self._leases.holder(self._missing[key]) != report.actor:
                 return False
             self._leases.finish(self._missing[key])

@@ -48,6 +48,10 @@ class Failures(Generic[Item]):
     def __init__(self) -> None:
         self._reports: dict[Item, set[str]] = {}
 
+    def counts(self, item: Item, report: str) -> bool:
+        """Whether a report of an item was counted before; it may come again, late."""
+        return report in self._reports.get(item, ())
+
     def add(self, item: Item, report: str) -> bool:
         """Count a failure of an item; whether the item has had all its TRIES.
 

@@ -414,7 +414,7 @@ def test_cases_that_cannot_be_simulated_are_given_up(
     assert setup.ask() == [case(20, 0)]
     for attempt in range(TRIES):
         assert setup.ask() == [case(44, 0)], "it is handed out again, without waiting for the lease"
-        report = failure(f"report{attempt}", seed=case(44, 0).seed)
+        report = failure(f"report{attempt}", actor="actor", seed=case(44, 0).seed)
         assert setup.fail(report) == setup.fail(report) == ""
     assert setup.ask() == []
     setup.send(setup.episode(case(0, 0)))

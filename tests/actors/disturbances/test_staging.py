@@ -11,7 +11,7 @@ import pytest
 
 from actors.disturbances.pictures import PICTURE_CHANGES
 from actors.disturbances.scenes import SCENE_CHANGES, VARIABLE_CHANGES, object_of, table_of
-from actors.disturbances.staging import check_abilities, stage
+from actors.disturbances.staging import check_abilities, check_staged, stage
 from actors.player import play
 from actors.policies.guided import GuidedPolicy
 from actors.policies.planned import make_tutor
@@ -110,11 +110,11 @@ def test_stretched_situations_lie_outside_the_ranges_but_inside_the_stretched_on
             assert situation == situation_of(task, conditions, seed)
             with pytest.raises(UserError, match="lies outside"):
                 task.check(situation)
-            stage(task, situation, conditions, seed)
+            check_staged(task, situation, conditions)
     assert situation_of(FIRST, None, 3) == FIRST.sample(3)
     far = {**FIRST.sample(3), "object_y_m": 0.4}
     with pytest.raises(UserError, match=r"object_y_m = 0\.4 lies outside"):
-        stage(FIRST, far, conditions, 3)
+        check_staged(FIRST, far, conditions)
 
 
 def test_scenes_change_by_the_strength() -> None:
