@@ -141,7 +141,8 @@ def read_episode(path: Path, *, partial: bool = False) -> Episode:
             fewer steps than were played, but the outcome of the whole episode.
 
     Raises:
-        UserError: the file is missing, truncated, damaged, not an episode, or recovered in part.
+        UserError: the file is missing, truncated, damaged, not an episode, recovered in part, or
+            without any step that was played.
     """
     contents = _contents(path)
     _check_format(path, contents)
@@ -150,8 +151,7 @@ def read_episode(path: Path, *, partial: bool = False) -> Episode:
         episode = _episode(contents)
     except (KeyError, ValueError, TypeError, AttributeError, DecodeError) as error:
         raise _not_an_episode(path, error) from error
-    if not partial:
-        _check_steps(path, episode.steps, expected)
+    _check_steps(path, episode.steps, expected, partial=partial)
     return episode
 
 
@@ -161,8 +161,12 @@ def _not_an_episode(path: Path, error: Exception) -> UserError:
     )
 
 
-def _check_steps(path: Path, steps: int, expected: int) -> None:
-    if steps != expected:
+def _check_steps(path: Path, steps: int, expected: int, *, partial: bool = False) -> None:
+    if expected and not steps:
+        raise UserError(
+            f"{path} holds none of the {expected} steps that were played; play the episode again"
+        )
+    if steps != expected and not partial:
         raise UserError(
             f"{path} holds {steps} of {expected} steps, recovered from a file that was cut "
             f"off. `vmdnn replay` can show it; for training or counting, play the episode again."

@@ -49,13 +49,17 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
         out: the file to write; None replaces `path`, unless `path` is intact.
 
     Raises:
-        UserError: `path` cannot be read, is not MCAP or has no complete message, or `out` cannot
-            be written.
+        UserError: `path` cannot be read, is not MCAP, has no complete message or is an episode cut
+            off before its first step was complete, or `out` cannot be written.
     """
     kept, intact = _whole_records(path)
     found = _count(kept, intact)
     if not found.messages:
         raise UserError(f"{path} has no complete message, so nothing can be recovered")
+    if found.steps_played and not found.steps:
+        raise UserError(
+            f"{path} has no complete step of {found.steps_played}, so nothing can be recovered"
+        )
     in_place = out is None or out.resolve() == path.resolve()
     if not (intact and in_place):
         with written_whole(out or path) as stream:
@@ -85,7 +89,9 @@ def _count(kept: Sequence[McapRecord], intact: bool) -> Recovered:
     played = [
         int(record.metadata["steps"])
         for record in kept
-        if isinstance(record, Metadata) and record.name == "episode" and "steps" in record.metadata
+        if isinstance(record, Metadata)
+        and record.name == "episode"
+        and record.metadata.get("steps", "").isdecimal()
     ]
     return Recovered(
         intact=intact,

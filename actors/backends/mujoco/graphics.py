@@ -19,6 +19,9 @@ DRIVERS: Final = ("egl", "osmesa")
 """Ways to get OpenGL without a screen, best first. OSMesa never uses a GPU."""
 VARIABLE: Final = "MUJOCO_GL"
 """Environment variable with which the user chooses one of them."""
+PYOPENGL_VARIABLE: Final = "PYOPENGL_PLATFORM"
+"""Environment variable that tells PyOpenGL the driver. MuJoCo sets it when it loads a driver, and
+refuses every other one as long as it is set."""
 TIMEOUT_S: Final = 120.0
 CURE: Final = """\
 MuJoCo renders with OpenGL, also without a GPU. What provides it (as root):
@@ -44,6 +47,8 @@ def diagnose() -> Diagnosis:
 
 def open_context(driver: str) -> Any:
     """A context of OpenGL, by "egl" or "osmesa"; what fails raises errors of many kinds."""
+    # The process that started this one may have set another driver, which is inherited.
+    os.environ[PYOPENGL_VARIABLE] = driver
     # mujoco's own name for its driver; each of these modules loads one when it is imported.
     return importlib.import_module(f"mujoco.{driver}").GLContext(1, 1)
 

@@ -111,8 +111,9 @@ def test_a_process_may_end_without_closing_its_simulator() -> None:
 
 @pytest.mark.skipif(ctypes.util.find_library("OSMesa") is None, reason="needs libosmesa6")
 def test_without_egl_it_draws_the_same_by_osmesa() -> None:
-    picture, _ = play("render")
-    by_osmesa, libraries = play("render", **NO_EGL)
+    """Also if the process inherits the setting of one that has rendered with EGL."""
+    picture, _ = play("render", PYOPENGL_PLATFORM="osmesa")
+    by_osmesa, libraries = play("render", PYOPENGL_PLATFORM="egl", **NO_EGL)
     assert "libOSMesa" in libraries
     assert np.abs(by_osmesa.astype(int) - picture).mean() < 0.1
 

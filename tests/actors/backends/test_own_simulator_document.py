@@ -39,16 +39,17 @@ def call(cwd: Path, path: Path, command: str) -> subprocess.CompletedProcess[str
 
 
 def test_its_backend_is_found_in_the_current_folder_and_plays(folder: Path) -> None:
-    command = f"services.cli evaluate --policy tutor --trials 2 --json --backend {BACKEND}"
+    """Also in worker processes, which find it for themselves."""
+    options = f"--trials 2 --workers 2 --json --backend {BACKEND}"
+    command = f"services.cli evaluate --policy tutor {options}"
     answer = call(folder, ROOT, command)
     assert answer.returncode == 0, answer.stderr
     assert f'"backend": "{BACKEND}"' in answer.stdout
 
 
 def test_its_backend_refuses_a_scene_with_a_screen(folder: Path) -> None:
-    command = (
-        f"services.cli evaluate --task experiment2 --policy tutor --trials 2 --backend {BACKEND}"
-    )
+    options = f"--trials 1 --workers 1 --backend {BACKEND}"
+    command = f"services.cli evaluate --task experiment2 --policy tutor {options}"
     answer = call(folder, ROOT, command)
     assert answer.returncode == 2, answer.stderr
     assert answer.stderr.strip().endswith(

@@ -26,7 +26,7 @@ from sim_assets.hand import MOTOR_NAMES
 
 OUTPUTS = 110
 STARTED_S = 1_700_000_000.25
-FORMAT_1 = Path(__file__).parents[2] / "data" / "format1"
+DATA = Path(__file__).parents[2] / "data"
 
 
 MakeEpisode = Callable[..., Episode]
@@ -268,6 +268,25 @@ def test_other_files_are_refused_by_name(tmp_path: Path) -> None:
         read_episode(foreign)
 
 
+def test_an_episode_without_any_of_its_steps_is_refused(
+    tmp_path: Path, make_episode: MakeEpisode
+) -> None:
+    """As another program may leave it that repairs MCAP files."""
+    path = tmp_path / "episode.mcap"
+    write_episode(path, make_episode(3))
+    with path.open("rb") as stream:
+        metadata = list(make_reader(stream).iter_metadata())
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for record in metadata:
+            writer.add_metadata(record.name, record.metadata)
+        writer.finish()
+    for partial in (False, True):
+        with pytest.raises(UserError, match="holds none of the 3 steps that were played"):
+            read_episode(path, partial=partial)
+
+
 def test_a_failed_write_keeps_the_old_file(tmp_path: Path, make_episode: MakeEpisode) -> None:
     path = tmp_path / "episode.mcap"
     write_episode(path, make_episode())
@@ -286,7 +305,7 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path, make_episode: Mak
 
 
 def test_a_file_of_format_1_can_be_read() -> None:
-    episode = read_episode(FORMAT_1 / "episode.mcap")
+    episode = read_episode(DATA / "format1" / "episode.mcap")
     assert (episode.id, episode.kind, episode.policy_version) == ("0123456789abcdef", Kind.TRIAL, 3)
     assert list(episode.phases) == list(range(8))
     assert episode.phase_names[:2] == ("phase 1", "phase 2")
@@ -296,6 +315,52 @@ def test_a_file_of_format_1_can_be_read() -> None:
     assert outcome.measures["moved_mm"] == Measure(1.0, "mm")
     assert outcome.measures["yaw_error_deg"] == Measure(11.0, "deg")
     assert outcome.measures["obstacle_touched_at"] == Measure(30.0, "step")
+
+
+def ramp(*shape: int) -> np.ndarray:
+    """Different numbers that float32 holds exactly, -16 to 16."""
+    return (np.arange(np.prod(shape)).reshape(shape) % 1024 / 32 - 16).astype(np.float32)
+
+
+def episode_of_format_2() -> Episode:
+    """What `format2/episode.mcap` was written from, with vmdnn before format 3."""
+    steps = 12
+    pictures = np.arange(steps * IMAGE_HEIGHT * IMAGE_WIDTH) % 251
+    return Episode(
+        id="fedcba9876543210",
+        kind=Kind.CORRECTION,
+        task="experiment2",
+        situation={"indicated_x_m": "-0.15", "object_y_m": 0.25},
+        seed=2**62 + 1,
+        actor="actor-1",
+        backend="sapien",
+        policy="network",
+        policy_version=7,
+        config_digest="c0ffee",
+        images=pictures.reshape(steps, IMAGE_HEIGHT, IMAGE_WIDTH).astype(np.uint8),
+        actions=ramp(steps, ACTION_SIZE),
+        targets=-ramp(steps, ACTION_SIZE),
+        joints_deg=5 * ramp(steps, len(JOINT_NAMES)),
+        phase_names=("watch", "reach", "grasp"),
+        phases=(np.arange(steps) // 4).astype(np.uint8),
+        body_names=("object", "r_hand_dh_frame"),
+        body_poses=ramp(steps, 2, 7) / 16,
+        outcome=Outcome(True, False, False, "imprecise", {"yaw_error_deg": Measure(1 / 3, "deg")}),
+        outputs=(ramp(steps, OUTPUTS) + 16) / 32,
+        control_period_s=0.05,
+        states={"pfc": ramp(steps, 3), "mstnn_fast": -ramp(steps, 5)},
+        training="ab12",
+    )
+
+
+def test_a_file_of_format_2_is_read_as_it_was_written(tmp_path: Path) -> None:
+    expected, path = episode_of_format_2(), tmp_path / "newest.mcap"
+    read = read_episode(DATA / "format2" / "episode.mcap")
+    write_episode(path, read)
+    for episode in (read, read_episode(path)):
+        for item in fields(Episode):
+            assert same(getattr(episode, item.name), getattr(expected, item.name)), item.name
+        assert (episode.started_s, episode.view) == (None, None)
 
 
 def test_a_file_of_a_newer_format_is_refused(

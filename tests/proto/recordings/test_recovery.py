@@ -6,19 +6,23 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.records import Channel, Chunk, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
 from processes import eventually
 
-from proto.episode import Episode
+from proto.episode import BoxLook, Episode, View
 from proto.errors import UserError
-from proto.recordings.episodes import read_episode, write_episode
+from proto.recordings.episodes import STEP, read_episode, write_episode
 from proto.recordings.recovery import recover
 from services.cli import main
+from services.robot_meshes import robot_meshes
 
 MakeEpisode = Callable[..., Episode]
 
@@ -27,48 +31,93 @@ STEPS = 125
 
 @pytest.fixture(scope="module")
 def episode(make_episode: MakeEpisode) -> Episode:
-    return make_episode(STEPS)
+    """An episode with every optional field."""
+    random = np.random.default_rng(0)
+    view = View(
+        boxes={"object": BoxLook((0.028, 0.1, 0.07), (0.8, 0.1, 0.1))},
+        fixed_links={"root_link": np.array([0, 0, 0.15, 1, 0, 0, 0], np.float32)},
+        focal_px=random.uniform(50, 900, (STEPS, 2)).astype(np.float32),
+    )
+    states = {"pfc": random.random((STEPS, 20), dtype=np.float32)}
+    return make_episode(STEPS, started_s=1_700_000_000.25, view=view, states=states)
 
 
 @pytest.fixture(scope="module")
 def recording(episode: Episode, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The bytes of a whole recording."""
     path = tmp_path_factory.mktemp("whole") / "episode.mcap"
-    write_episode(path, episode)
+    write_episode(path, episode, robot=robot_meshes())
     return path.read_bytes()
 
 
+@pytest.fixture(scope="module")
+def chunks(recording: bytes) -> list[tuple[int, int]]:
+    """For each chunk of the recording: where it ends, and how many steps are complete by then."""
+    stream = BytesIO(recording)
+    ends, steps, channel = [], 0, None
+    for chunk in StreamReader(stream, emit_chunks=True).records:
+        if isinstance(chunk, Chunk):
+            for record in breakup_chunk(chunk):
+                if isinstance(record, Channel) and record.topic == STEP:
+                    channel = record.id
+                steps += isinstance(record, Message) and record.channel_id == channel
+            ends.append((stream.tell(), steps))
+    return ends
+
+
 def assert_is_start_of(part: Episode, whole: Episode) -> None:
-    assert (part.id, part.outcome, part.situation) == (whole.id, whole.outcome, whole.situation)
+    for name in ("id", "outcome", "situation", "started_s"):
+        assert getattr(part, name) == getattr(whole, name), name
     for name in ("images", "actions", "targets", "joints_deg", "phases", "body_poses", "outputs"):
         assert np.array_equal(getattr(part, name), getattr(whole, name)[: part.steps]), name
+    assert part.states is not None
+    assert whole.states is not None
+    assert part.states.keys() == whole.states.keys()
+    for name, activity in whole.states.items():
+        assert np.array_equal(part.states[name], activity[: part.steps]), name
+    assert part.view is not None
+    assert whole.view is not None
+    assert part.view.boxes == whole.view.boxes
+    assert part.view.fixed_links.keys() == whole.view.fixed_links.keys()
+    for name, pose in whole.view.fixed_links.items():
+        assert np.array_equal(part.view.fixed_links[name], pose), name
+    assert np.array_equal(part.view.focal_px, whole.view.focal_px[: part.steps])
 
 
 @settings(max_examples=60)
 @given(data=st.data())
-def test_a_truncated_file_keeps_its_complete_steps(
+def test_a_truncated_file_keeps_the_steps_of_every_complete_chunk(
     data: st.DataObject,
     recording: bytes,
+    chunks: list[tuple[int, int]],
     episode: Episode,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     path = tmp_path_factory.mktemp("cut") / "episode.mcap"
-    size = data.draw(st.integers(0, len(recording) - 1))
+    near_an_end = st.sampled_from(chunks).flatmap(
+        lambda chunk: st.integers(chunk[0] - 2, min(chunk[0] + 2, len(recording) - 1))
+    )
+    size = data.draw(st.integers(0, len(recording) - 1) | near_an_end)
     path.write_bytes(recording[:size])
-    try:
-        found = recover(path)
-    except UserError:
-        # Nothing is lost by refusing: at most the first chunk was there.
-        assert size < len(recording) / 5
+    complete = max((steps for end, steps in chunks if end <= size), default=0)
+    if complete == 0:
+        with pytest.raises(UserError, match=r"no complete (step|message)|is not an MCAP file"):
+            recover(path)
         assert path.read_bytes() == recording[:size]
         return
+    found = recover(path)
     part = read_episode(path, partial=True)
     assert_is_start_of(part, episode)
     assert not found.intact
-    assert (found.steps, found.steps_played) == (part.steps, STEPS)
-    # One chunk at most is lost: what was kept is not much less than what was there.
-    assert part.steps / STEPS > size / len(recording) - 0.2
+    assert (part.steps, found.steps, found.steps_played) == (complete, complete, STEPS)
     assert recover(path).intact
+
+
+def test_a_chunk_holds_few_steps(chunks: list[tuple[int, int]]) -> None:
+    """As many are lost if the process is killed; what viewers need once is in no chunk of steps."""
+    steps = np.diff([0, *(steps for _, steps in chunks)])
+    assert steps[0] == 0
+    assert steps.max() <= 15
 
 
 def test_a_process_killed_while_recording_leaves_a_recoverable_file(
@@ -86,7 +135,7 @@ arrays = {{
     name: np.concatenate([getattr(episode, name)] * 500)
     for name in ("images", "actions", "targets", "joints_deg", "phases", "body_poses", "outputs")
 }}
-write_episode(Path({str(target)!r}), replace(episode, **arrays))
+write_episode(Path({str(target)!r}), replace(episode, view=None, states=None, **arrays))
 """
     source.write_bytes(recording)
     process = subprocess.Popen([sys.executable, "-c", script])

@@ -137,7 +137,9 @@ def test_ctrl_c_stops_cleanly(tmp_path: Path) -> None:
     )
     try:
         eventually(
-            lambda: bool(list(tmp_path.glob("*.mcap"))) or process.poll() is not None, "a recording"
+            lambda: bool(list(tmp_path.glob("*.mcap"))) or process.poll() is not None,
+            "a recording",
+            patience_s=180.0,  # two workers start, each with all libraries, and play an episode
         )
         os.killpg(process.pid, signal.SIGINT)
         _, errors = process.communicate(timeout=60)
