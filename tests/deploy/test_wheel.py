@@ -78,8 +78,8 @@ def test_doctor_does_not_ask_for_a_checkout(vmdnn: Run) -> None:
     assert found["packages"]["ok"], found["packages"]
 
 
-def test_an_actor_starts_with_a_built_in_configuration(vmdnn: Run) -> None:
-    ended = vmdnn("actor", "--config", "smoke", "--connect", free_endpoint())
+def test_a_built_in_configuration_is_found(vmdnn: Run) -> None:
+    ended = vmdnn("watch", "--once", "--config", "smoke", "--connect", free_endpoint())
     assert ended.returncode == 2
     assert "start one with `vmdnn hub`" in ended.stderr
 

@@ -26,7 +26,9 @@ class IdleProcess:
         self.saved = 0
 
     def metrics(self) -> HubMetrics:
-        return HubMetrics(id=self._bus.id, time_s=time.time(), refused=0, peers=self.saved)
+        return HubMetrics(
+            role=self._bus.role, id=self._bus.id, time_s=time.time(), refused=0, peers=self.saved
+        )
 
     def checkpoint(self) -> str:
         self.saved += 1

@@ -34,6 +34,7 @@ MESSAGES = (
     messages.Live,
     messages.Control,
     messages.ControlReply,
+    messages.Settings,
     *METRICS,
 )
 
@@ -90,6 +91,7 @@ def test_every_key_is_documented() -> None:
         keys.failure("<actor>"),
         keys.receipt("<role>", "<actor>"),
         keys.verdict,
+        keys.settings,
         keys.request_tutoring,
         keys.request_trial,
         keys.live("<actor>"),
