@@ -63,7 +63,7 @@ def config_file(name: str) -> Path:
         UserError: there is neither a file nor a built-in configuration of this name.
     """
     path = Path(name)
-    if path.exists() or path.suffix or path.name != name:
+    if path.is_file() or path.suffix or path.name != name:  # a run may have a folder of that name
         return path
     built_in = {file.stem: file for file in Path(str(files("deploy")), "config").glob("*.yaml")}
     if name not in built_in:
