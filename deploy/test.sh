@@ -11,4 +11,5 @@ cd "$ROOT"
 .venv/bin/ruff format --check .
 .venv/bin/ruff check .
 .venv/bin/mypy
-exec .venv/bin/python -m pytest "$@"
+# A process for each core, but no more than four: each needs up to 2 GB. A file stays in one process.
+exec .venv/bin/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile "$@"

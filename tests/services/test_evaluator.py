@@ -302,15 +302,18 @@ def test_a_trial_whose_simulation_fails_three_times_is_a_failure(
     assert setup.ask_until_given(actor, 1) == 70
     trial = {"actor": "a", "kind": Kind.TRIAL, "training": "training", "policy_version": 1}
     trial["situation"] = dict(TASK.sample(70))
-    for name in ("first", "first", "second"):
+    for name in ("first", "second"):
         assert setup.fail(actor, failure(name, seed=70, **trial)) == ""
         assert setup.ask(actor, 1) == [70], "it is tried again"
+    late = failure("first", seed=70, **trial)
+    assert setup.fail(actor, late) == "", "a copy of a report counts once"
+    assert setup.ask(actor, 1) == [71], "and the trial is still being played"
     assert setup.fail(actor, failure("third", seed=70, **trial)) == ""
     assert "seed 99" in setup.fail(actor, failure("nobody-asked", seed=99, **trial))
     metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 1})
     assert metrics.policies[0].reasons == {"simulation_failed": 1}
     assert metrics.policies[0].lenient.successes == 0
-    assert setup.ask(actor, 1) == [71]
+    assert setup.ask(actor, 1) != [70]
     setup.process.kill()
     setup.process.wait()
     setup.start()
@@ -348,7 +351,7 @@ def test_a_paused_evaluator_counts_but_assigns_no_trials(setup: EvaluatorSetup) 
     setup.send(actor, 70, 1)
     setup.wait_for_metrics(lambda metrics: metrics.paused and counts(metrics) == {1: 1})
     actor.ask(control, Control(Command.RESUME), ControlReply)
-    assert setup.ask(actor, 1) == [71]
+    assert setup.ask(actor, 1) == []
     actor.ask(control, Control(Command.STOP), ControlReply)
     assert setup.process.wait(30) == 0
 
