@@ -195,7 +195,7 @@ class Bus:
         """Log from now on when the hub at an endpoint is lost, and when it is back."""
         LOG.info("connected to the hub at %s", endpoint)
 
-        def on_change(_event: zenoh.TransportEvent) -> None:
+        def look() -> None:
             with self._connection:
                 away = not self.peers
                 if away == self._hub_is_away or self._session.is_closed():
@@ -206,8 +206,12 @@ class Bus:
             else:
                 LOG.info("the hub at %s is back", endpoint)
 
+        def on_change(_event: zenoh.TransportEvent) -> None:
+            look()
+
         listener = self._session.info.declare_transport_events_listener(on_change)
         self._declared.append(listener)
+        look()  # the hub may have gone before anyone listened
 
     def close(self) -> None:
         """Close the connection; further calls do nothing."""

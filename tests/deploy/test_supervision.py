@@ -73,7 +73,8 @@ class Watch:
 
     def wait_for_another(self, than: int) -> None:
         def another() -> bool:
-            self.look(1)
+            self.now_s += 0.1  # slowly: supervisord needs a moment to see that a process has ended
+            self._watchdog.look()
             return self.pid not in (0, than)
 
         eventually(another, "another process runs")
@@ -81,8 +82,12 @@ class Watch:
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
 def test_a_process_that_was_killed_is_started_again(tmp_path: Path, number: int) -> None:
-    with Supervisor([Program("actor", SLEEP)], tmp_path) as supervisor:
+    lives = (sys.executable, "-c", "print('up', flush=True); import time; time.sleep(600)")
+    log = tmp_path / "actor.log"
+    with Supervisor([Program("actor", lives)], tmp_path) as supervisor:
         watch = Watch(supervisor)
+        # Before its program runs, a process has supervisord's handler of SIGTERM.
+        eventually(lambda: log.exists() and "up" in log.read_text(), "its program runs")
         watch.look(1)
         first = watch.pid
         os.kill(first, number)

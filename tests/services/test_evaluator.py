@@ -351,7 +351,7 @@ def test_a_paused_evaluator_counts_but_assigns_no_trials(setup: EvaluatorSetup) 
     setup.send(actor, 70, 1)
     setup.wait_for_metrics(lambda metrics: metrics.paused and counts(metrics) == {1: 1})
     actor.ask(control, Control(Command.RESUME), ControlReply)
-    assert setup.ask(actor, 1) == []
+    assert setup.ask(actor, 1) == [71]
     actor.ask(control, Control(Command.STOP), ControlReply)
     assert setup.process.wait(30) == 0
 
