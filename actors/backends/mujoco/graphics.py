@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import functools
 import importlib
-import json
 import os
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from actors.backends.probing import ProbeError, answer_of
 from actors.simulator import OTHER_SYSTEM, Diagnosis
 from proto.errors import UserError
 
@@ -22,7 +20,6 @@ VARIABLE: Final = "MUJOCO_GL"
 PYOPENGL_VARIABLE: Final = "PYOPENGL_PLATFORM"
 """Environment variable that tells PyOpenGL the driver. MuJoCo sets it when it loads a driver, and
 refuses every other one as long as it is set."""
-TIMEOUT_S: Final = 120.0
 CURE: Final = """\
 MuJoCo renders with OpenGL, also without a GPU. What provides it (as root):
   Debian and Ubuntu, no NVIDIA card, by EGL:
@@ -84,27 +81,8 @@ def _examine() -> tuple[str, Diagnosis]:
 
 def _try(driver: str) -> tuple[str, str]:
     """Render with a driver; return the device that rendered, and the problem, empty if none."""
-    probe = Path(__file__).with_name("probe.py")
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(sys.path),
-        "PYTHONWARNINGS": "ignore",
-    }
     try:
-        result = subprocess.run(
-            [sys.executable, "-P", str(probe), driver],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return "", f"the graphics driver hung for {TIMEOUT_S:.0f} s"
-    if result.returncode < 0:
-        return "", f"the graphics driver crashed (signal {-result.returncode})"
-    if result.returncode > 0:
-        last = (result.stderr.strip().splitlines() or ["no message"])[-1]
-        return "", f"the attempt ended with status {result.returncode}: {last}"
-    answer = json.loads(result.stdout.splitlines()[-1])
+        answer = answer_of(Path(__file__).with_name("probe.py"), driver)
+    except ProbeError as error:
+        return "", str(error)
     return answer["device"], answer["problem"]

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import functools
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
+from actors.backends.probing import ProbeError, answer_of
 from actors.simulator import OTHER_SYSTEM, Diagnosis
 from proto.errors import UserError
 
-TIMEOUT_S: Final = 120.0
 CURE: Final = """\
 SAPIEN renders with Vulkan, also without a GPU. What provides it (as root):
   Debian 12, no NVIDIA card: Mesa 24.3 or newer, which is in bookworm-backports:
@@ -34,26 +30,10 @@ PACKAGES: Final[Mapping[str, tuple[str, ...]]] = {
 
 def diagnose() -> Diagnosis:
     """Render a picture in another process and say how that went; takes about a second."""
-    probe = Path(__file__).with_name("probe.py")
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(sys.path),
-        "PYTHONWARNINGS": "ignore",
-    }
     try:
-        result = subprocess.run(
-            [sys.executable, "-P", str(probe)],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=TIMEOUT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return _failed(f"the graphics driver hung for {TIMEOUT_S:.0f} s")
-    if result.returncode != 0:
-        return _failed(_crash(result))
-    answer = json.loads(result.stdout.splitlines()[-1])
+        answer = answer_of(Path(__file__).with_name("probe.py"))
+    except ProbeError as error:
+        return _failed(str(error))
     if answer["problem"]:
         return _failed(_driver_problem(answer["problem"], answer["known"]))
     return Diagnosis(True, f"SAPIEN renders on {answer['device']}")
@@ -74,13 +54,6 @@ def require_graphics() -> None:
 
 def _failed(problem: str) -> Diagnosis:
     return Diagnosis(False, f"SAPIEN cannot render: {problem}", CURE, PACKAGES)
-
-
-def _crash(result: subprocess.CompletedProcess[str]) -> str:
-    if result.returncode < 0:
-        return f"the graphics driver crashed (signal {-result.returncode})"
-    last = (result.stderr.strip().splitlines() or ["no message"])[-1]
-    return f"the attempt ended with status {result.returncode}: {last}"
 
 
 def _driver_problem(problem: str, known: list[tuple[str, str]]) -> str:

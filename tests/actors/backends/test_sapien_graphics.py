@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from actors.backends import light
+from actors.backends import light, probing
 from actors.backends.sapien import graphics, renderer
 from actors.backends.sapien.probe import known_devices
 from actors.backends.sapien.simulator import SapienSimulator
@@ -94,7 +94,7 @@ def test_a_driver_that_kills_its_process_is_reported(monkeypatch, tmp_path, beha
     doomed.write_text(f"#!/bin/sh\n{behaviour}\n")
     doomed.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(doomed))
-    monkeypatch.setattr(graphics, "TIMEOUT_S", 2.0)
+    monkeypatch.setattr(probing, "TIMEOUT_S", 2.0)
     diagnosis = graphics.diagnose()
     assert problem in diagnosis.found
     assert "bookworm-backports" in diagnosis.text()
