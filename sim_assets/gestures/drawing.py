@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from typing import Final
 
@@ -108,7 +109,15 @@ class DrawnGestures:
         Raises:
             ValueError: a name is not a whole number of at least 0.
         """
-        return draw_clip(side, Subject.from_seed(_seed(subject)), _seed(take))
+        return _drawn(side, _seed(subject), _seed(take))
+
+
+@functools.lru_cache(maxsize=1)
+def _drawn(side: Side, subject: int, take: int) -> Clip:
+    """Draw a clip, which cannot be written to; an actor asks twice for each: to check, to play."""
+    clip = draw_clip(side, Subject.from_seed(subject), take)
+    clip.flags.writeable = False
+    return clip
 
 
 def _seed(name: str) -> int:
