@@ -37,6 +37,10 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "train": ("services.commands.train", "train a network on recorded sequences"),
     "evaluate": ("services.commands.evaluate", "test a policy in situations not tutored"),
     "compare": ("services.commands.compare", "train and test VMDNN and other networks"),
+    "compare-trials": (
+        "services.commands.compare_trials",
+        "compare two policies in the same situations",
+    ),
     "figure": ("services.commands.figure", "draw a figure of the paper, or of failures"),
     "replay": ("services.commands.replay", "make a video of a recorded episode"),
     "export": ("services.commands.export", "write recordings in a format of others"),
