@@ -8,15 +8,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from actors.simulator import Pose, StepReport
 from actors.tasks.experiment2.setting import PlacedObject, Setting
+from actors.tasks.experiment2.world import first_steps
 from actors.tasks.grasp_reading import (
     GraspTolerance,
     HandOffset,
@@ -27,7 +30,7 @@ from actors.tasks.grasp_reading import (
 )
 from proto.episode import NO_FAILURE, Measure, Outcome
 from proto.variables import Situation
-from sim_assets.icub import HAND
+from sim_assets.icub import EYE, HAND
 
 Array = NDArray[np.float64]
 
@@ -37,6 +40,8 @@ MOVED_MM: Final = 10.0
 TOPPLED_DEG: Final = 15.0
 OTHER_MOVED_MM: Final = 5.0
 TOLERANCE: Final = GraspTolerance(yaw_error_deg=8.0, along_mm=15.0, across_mm=10.0)
+
+ATTEND_OBJECT: Final = "attend object"
 
 WRONG_OBJECT: Final = "wrong_object"
 OTHER_MOVED: Final = "other_moved"
@@ -53,6 +58,7 @@ class _Instant:
 
     joints_deg: Array
     hand: Pose
+    eye: Pose
     indicated: Pose
     other: Pose
 
@@ -79,15 +85,23 @@ class _Approach:
 class Experiment2Judge:
     """Judges one episode from true poses and the measured hand.
 
-    Measures: `lifted_m` and `other_lifted_m`, heights of the objects above their starts at the end;
-    `other_moved_mm`, the farthest that the other object ever was from its start; the attributes of
-    `_Approach` and `HandOffset` at the last step before the hand closed; `closed_at`, the step at
-    which it closed, -1 if it did not.
+    Measures: `gaze_deg` and `other_gaze_deg`, the angles between the eye's optical axis and the
+    directions of the indicated and of the other object at the end of `attend object`; `lifted_m`
+    and `other_lifted_m`, heights of the objects above their starts at the end; `other_moved_mm`,
+    the farthest that the other object ever was from its start; the attributes of `_Approach` and
+    `HandOffset` at the last step before the hand closed; `closed_at`, the step at which it closed,
+    -1 if it did not.
     """
 
-    def __init__(self, situation: Situation) -> None:
-        """Start watching an episode of `situation`."""
+    def __init__(self, situation: Situation, subtasks: Mapping[str, int]) -> None:
+        """Start watching an episode of `situation`.
+
+        Args:
+            situation: the values of the task's variables.
+            subtasks: the subtasks in their order, and the number of control steps of each.
+        """
         setting = Setting.of(situation)
+        self._attended_at = first_steps(subtasks)[ATTEND_OBJECT] + subtasks[ATTEND_OBJECT] - 1
         self._indicated, self._other = setting.indicated, setting.other
         self._instants: list[_Instant] = []
 
@@ -97,6 +111,7 @@ class Experiment2Judge:
             _Instant(
                 joints_deg=joints_deg,
                 hand=bodies[HAND],
+                eye=bodies[EYE],
                 indicated=bodies[self._indicated.name],
                 other=bodies[self._other.name],
             )
@@ -110,6 +125,7 @@ class Experiment2Judge:
         before = self._approach(
             instants[max(closed_step - 1, 0)] if closed_step >= 0 else instants[-1]
         )
+        attended = instants[self._attended_at]
         lifted_m = [
             _height_m(self._indicated, instant.indicated) for instant in instants[-HELD_STEPS:]
         ]
@@ -134,6 +150,8 @@ class Experiment2Judge:
             precise=reason == NO_FAILURE,
             reason=reason,
             measures={
+                "gaze_deg": Measure(_gaze_deg(attended.eye, attended.indicated), "deg"),
+                "other_gaze_deg": Measure(_gaze_deg(attended.eye, attended.other), "deg"),
                 "lifted_m": Measure(lifted_m[-1], "m"),
                 "other_lifted_m": Measure(other_lifted_m, "m"),
                 "other_moved_mm": Measure(other_moved_mm, "mm"),
@@ -157,6 +175,14 @@ class Experiment2Judge:
             other_distance_mm=_distance_mm(instant.hand, instant.other),
             hand=hand_offset(instant.hand, instant.indicated),
         )
+
+
+def _gaze_deg(eye: Pose, body: Pose) -> float:
+    """Angle between the eye's optical axis, its x axis, and the direction of a body."""
+    axis = Rotation.from_quat(eye.quaternion, scalar_first=True).apply((1.0, 0.0, 0.0))
+    direction = np.subtract(body.position_m, eye.position_m)
+    cosine = float(np.dot(axis, direction) / np.linalg.norm(direction))
+    return math.degrees(math.acos(min(cosine, 1.0)))  # rounding may exceed 1
 
 
 def _height_m(placed: PlacedObject, now: Pose) -> float:

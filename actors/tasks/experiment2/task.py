@@ -133,7 +133,7 @@ class Experiment2(Task):
 
     def judge(self, situation: Situation) -> Experiment2Judge:
         """A judge for one episode of a situation."""
-        return Experiment2Judge(situation)
+        return Experiment2Judge(situation, self.subtasks)
 
 
 def _questions(subtasks: Mapping[str, int]) -> tuple[Question, ...]:

@@ -12,7 +12,7 @@ from actors.tasks.registry import make_task
 from proto.config import TaskConfig
 from proto.episode import NO_FAILURE
 from sim_assets.hand import CLOSED_DEG, GRASP_AXIS, GRASP_CENTRE_M, OPEN_DEG
-from sim_assets.icub import HAND
+from sim_assets.icub import EYE, HAND
 
 TASK = make_task(TaskConfig(name="experiment2"))
 SITUATION = {
@@ -47,12 +47,33 @@ def hand_at(pose, hand_yaw=0.0, along=0.0, across=0.0):
     return Pose(tuple(centre - hand.apply(GRASP_CENTRE_M)), tuple(np.roll(hand.as_quat(), 1)))
 
 
-def bodies(*, indicated=(0.0, 0.0, 0.0), other=(0.0, 0.0, 0.0), tilt=0.0, at="indicated", **hand):
+def eye_towards(place, aside_deg=0.0):
+    """Return the pose of an eye whose optical axis, x, misses a place by an angle."""
+    eye = np.array([-0.03, 0.02, 0.5])
+    to_place = Rotation.align_vectors([np.subtract(place, eye)], [[1.0, 0.0, 0.0]])[0]
+    turn = to_place * Rotation.from_euler("z", aside_deg, degrees=True)
+    return Pose(tuple(eye), tuple(turn.as_quat(scalar_first=True)))
+
+
+def bodies(
+    *,
+    indicated=(0.0, 0.0, 0.0),
+    other=(0.0, 0.0, 0.0),
+    tilt=0.0,
+    at="indicated",
+    seen="indicated",
+    aside_deg=0.0,
+    **hand,
+):
     placed = {
         "indicated_object": moved_pose(SETTING.indicated.pose, indicated, tilt),
         "other_object": moved_pose(SETTING.other.pose, other),
     }
-    return {**placed, HAND: hand_at(placed[f"{at}_object"], **hand)}
+    return {
+        **placed,
+        HAND: hand_at(placed[f"{at}_object"], **hand),
+        EYE: eye_towards(placed[f"{seen}_object"].position_m, aside_deg),
+    }
 
 
 def judged(before=None, after=None, *, closed=True):
@@ -129,6 +150,15 @@ def test_an_object_that_is_not_lifted_or_not_held_fails():
         judge.watch(StepReport(frozenset()), joints, bodies(indicated=(0.0, 0.0, height)))
     assert readings(judge.outcome()) == (True, False, False)
     assert judge.outcome().reason == "not_lifted"
+
+
+def test_the_gaze_tells_which_object_is_attended():
+    right = judged(bodies(aside_deg=3.0))
+    assert right.value("gaze_deg") == pytest.approx(3.0, abs=0.01)
+    assert right.value("other_gaze_deg") > 20
+    wrong = judged(bodies(seen="other"))
+    assert wrong.value("other_gaze_deg") == pytest.approx(0.0, abs=0.01)
+    assert wrong.value("gaze_deg") > 20
 
 
 def test_a_hand_that_never_closes_fails():
