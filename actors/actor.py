@@ -22,6 +22,7 @@ from actors.receipts import Receipts
 from actors.simulator import make_simulator, player_of
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
+from actors.view import view_of
 from learner.checkpoint import Checkpoint
 from learner.network_policy import NetworkPolicy
 from learner.policy_message import policy_of
@@ -123,6 +124,9 @@ def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
         image=live.image,
         joints_deg=live.joints_deg.astype(np.float32),
         action=live.action.astype(np.float32),
+        body_names=tuple(live.bodies.places),
+        body_poses=live.bodies.rows.astype(np.float32),
+        view=view_of(live.scene, [live.crop]),
     )
 
 

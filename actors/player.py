@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from actors.attention import clip_action, crop_of_focus, targets_of_action, with_attention_of
 from actors.disturbances.staging import check_abilities, check_staged, stage
 from actors.policies.contract import InformedPolicy, Policy
-from actors.simulator import Simulator
+from actors.simulator import Bodies, Crop, Scene, Simulator
 from actors.tasks.contract import Task
 from actors.view import view_of
 from proto.body import FOCUS
@@ -34,6 +34,9 @@ class LiveStep:
         image: (48, 64) uint8, the network's picture.
         joints_deg: (18,) measured before the action (degrees).
         action: (11,) the commanded action.
+        bodies: where all bodies are before the action.
+        scene: what the episode began with.
+        crop: the part of the eye image that is seen.
     """
 
     step: int
@@ -41,6 +44,9 @@ class LiveStep:
     image: Image
     joints_deg: Array
     action: Array
+    bodies: Bodies
+    scene: Scene
+    crop: Crop
 
 
 def play(
@@ -97,9 +103,21 @@ def play(
         seen = simulator.observe(crops[-1])
         image = staging.picture(step, seen.image)
         action = _with_task_attention(task, clip_action(policy.step(image)))
-        poses.append(simulator.bodies().rows)
+        bodies = simulator.bodies()
+        poses.append(bodies.rows)
         if on_step is not None:
-            on_step(LiveStep(step, task.phase_names[phase], image, seen.joints_deg, action))
+            on_step(
+                LiveStep(
+                    step=step,
+                    phase=task.phase_names[phase],
+                    image=image,
+                    joints_deg=seen.joints_deg,
+                    action=action,
+                    bodies=bodies,
+                    scene=staging.scene,
+                    crop=crops[-1],
+                )
+            )
         report = simulator.step(targets_of_action(action))
         judge.watch(report, simulator.joints_deg(), simulator.bodies())
         images.append(image)

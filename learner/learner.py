@@ -54,7 +54,7 @@ from proto.messages import (
     TutoringRequest,
     Verdict,
 )
-from proto.metrics import LearnerMetrics, Stage
+from proto.metrics import LARGEST_LEARNING_RATE, LearnerMetrics, Stage
 from proto.pace import Pace
 from proto.plain_text import plain
 from proto.players import Players
@@ -185,7 +185,9 @@ class Learner:
             stage=self._stage,
             epoch=self._trainer.epochs_done,
             epochs_total=self._trainer.epochs_total,
-            loss=None if self._trainer.loss is None else min(self._trainer.loss, LARGEST_LOSS),
+            loss=_at_most(LARGEST_LOSS, self._trainer.loss),
+            learning_rate=_at_most(LARGEST_LEARNING_RATE, self._trainer.learning_rate),
+            training=self._run_id,
             sequences=self._sequences,
             round=self._trainer.round,
             corrections=awaited.kept if awaited else 0,
@@ -472,6 +474,11 @@ class Learner:
             self._bus.keys.policy, policy_message(self._run_id, metadata, content)
         )
         LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
+
+
+def _at_most(largest: float, number: float | None) -> float | None:
+    """A number that metrics can hold."""
+    return None if number is None else min(number, largest)
 
 
 def _delete_unfinished_files(folder: Path) -> None:

@@ -265,11 +265,22 @@ class Bus:
             wire.payload, encoding=wire.encoding, attachment=self._attachment(wire)
         )
 
-    def subscribe(self, key: str, callback: Callable[[M], None], *classes: type[M]) -> None:
-        """Call `callback` with every message of `classes` under a key."""
-        self._declared.append(
-            self._session.declare_subscriber(key, self._receiver(callback, classes))
-        )
+    def subscribe(
+        self, key: str, callback: Callable[[M], None], *classes: type[M]
+    ) -> Callable[[], None]:
+        """Call `callback` with every message of `classes` under a key.
+
+        Returns:
+            A function that ends the subscription, if it is to end before the bus is closed.
+        """
+        declared = self._session.declare_subscriber(key, self._receiver(callback, classes))
+        self._declared.append(declared)
+
+        def end() -> None:
+            self._declared = [each for each in self._declared if each is not declared]
+            declared.undeclare()  # type: ignore[no-untyped-call]
+
+        return end
 
     def subscribe_with_sender(
         self, key: str, callback: Callable[[M, Sender], None], *classes: type[M]

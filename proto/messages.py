@@ -20,6 +20,7 @@ from proto.codec import (
     record_of,
 )
 from proto.episode import (
+    BODIES,
     JOINTS,
     LARGEST_DEG,
     ConditionsField,
@@ -29,6 +30,7 @@ from proto.episode import (
     Image,
     Kind,
     Outcome,
+    View,
 )
 from proto.keys import Role
 from proto.seeds import SEEDS_PER_CASE
@@ -293,7 +295,7 @@ class Settings:
     values: Annotated[tuple[Setting, ...], Many(record_of(Setting), Size("values", 0, 1000))]
 
 
-@message("live", 3)
+@message("live", 4)
 @dataclass(frozen=True)
 class Live:
     """One control step as it happens.
@@ -308,6 +310,10 @@ class Live:
         image: (48, 64) uint8, the network's grey picture.
         joints_deg: (18,) float32, neck, arm and hand as measured.
         action: (11,) float32, the commanded action.
+        body_names: names of the B bodies.
+        body_poses: (B, 7) float32, position (m) and quaternion (w first) in the world frame, at
+            the same time as the picture.
+        view: what a viewer needs besides, of this step alone.
     """
 
     actor: Id
@@ -319,6 +325,14 @@ class Live:
     image: Annotated[Image, Array("uint8", (IMAGE_HEIGHT, IMAGE_WIDTH))]
     joints_deg: Annotated[Floats, Array("float32", (JOINTS,), -LARGEST_DEG, LARGEST_DEG)]
     action: Annotated[Floats, Array("float32", (ACTION_SIZE,), -LARGEST_DEG, LARGEST_DEG)]
+    body_names: Annotated[tuple[str, ...], Many(Text(64), BODIES)]
+    body_poses: Annotated[Floats, Array("float32", (BODIES, 7), -1e3, 1e3)]
+    view: View
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if the view is not that of one step."""
+        if len(self.view.focal_px) != 1:
+            raise ValueError(f"view: expected that of 1 step, got {len(self.view.focal_px)}")
 
 
 class Command(StrEnum):

@@ -27,6 +27,11 @@ from proto.suites import MOST_SUITES, SuiteName
 Count = Annotated[int, Integer(0, 2**53)]
 Rate = Annotated[float, Number(0.0, 1e9)]
 Fraction = Annotated[float, Number(0.0, 1.0)]
+LARGEST_LEARNING_RATE: Final = 1e9
+Loss = Annotated[float | None, Maybe(Number(0.0, 1e9))]
+LearningRate = Annotated[float | None, Maybe(Number(0.0, LARGEST_LEARNING_RATE))]
+Training = Annotated[str, Text(64)]
+"""Id of a training; empty for one without the bus."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +95,7 @@ class Stage(StrEnum):
     FINISHED = "finished"
 
 
-@message("metrics.learner", 4, form="json")
+@message("metrics.learner", 5, form="json")
 @dataclass(frozen=True, kw_only=True)
 class LearnerMetrics(Metrics):
     """Metrics of the learner.
@@ -100,6 +105,9 @@ class LearnerMetrics(Metrics):
         epoch: epochs done in this stage.
         epochs_total: number of epochs of this stage.
         loss: loss of the last epoch; null before the first.
+        learning_rate: learning rate of the last epoch; null before the first since the process
+            started.
+        training: id of the training.
         sequences: stored sequences, including those of pre-training.
         round: number of the current round of corrections; 0 before the first.
         corrections: stored corrections of this round; 0 unless the stage is `waiting`.
@@ -119,7 +127,9 @@ class LearnerMetrics(Metrics):
     stage: Stage
     epoch: Count
     epochs_total: Count
-    loss: Annotated[float | None, Maybe(Number(0.0, 1e9))]
+    loss: Loss
+    learning_rate: LearningRate
+    training: Training
     sequences: Count
     round: Count
     corrections: Count

@@ -56,10 +56,23 @@ def parts_in(folder: Path) -> list[Path]:
 
 
 def append_line(path: Path, line: bytes) -> None:
-    """Append a line to a file; `line` ends with a newline. A missing file is made.
+    """Append a line, or several, to a file; the last one ends with a newline. See `append`.
 
-    If the writing fails, the file stays as it was. A killed process or a power failure may leave
-    an unfinished last line, which `drop_unfinished_line` removes.
+    A killed process or a power failure may leave an unfinished last line, which
+    `drop_unfinished_line` removes.
+
+    Raises:
+        DiskFullError: no space is left.
+        StorageError: the file cannot be written for another reason.
+    """
+    append(path, line)
+
+
+def append(path: Path, content: bytes) -> None:
+    """Append to a file. A missing file is made.
+
+    If the writing fails, the file stays as it was. A killed process or a power failure may leave a
+    part of the content.
 
     Raises:
         DiskFullError: no space is left.
@@ -69,7 +82,7 @@ def append_line(path: Path, line: bytes) -> None:
     with storage_errors(path), path.open("ab", buffering=0) as stream:
         size = stream.seek(0, os.SEEK_END)
         try:
-            _write_all(stream, line)
+            _write_all(stream, content)
             os.fsync(stream.fileno())
         except OSError:
             stream.truncate(size)

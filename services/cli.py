@@ -32,6 +32,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "evaluator": ("services.commands.evaluator", "assign trials and count successes"),
     "recorder": ("services.commands.recorder", "record every episode as MCAP"),
     "watch": ("services.commands.watch", "show what all processes are doing"),
+    "metrics": ("services.commands.metrics", "tell the metrics of a run to Prometheus"),
+    "live": ("services.commands.live", "show the actors of a run in Foxglove, as they act"),
     "control": ("services.commands.control", "pause, resume or stop processes of a run"),
     "tutor": ("services.commands.tutor", "record tutoring sequences, without the bus"),
     "train": ("services.commands.train", "train a network on recorded sequences"),

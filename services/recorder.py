@@ -1,4 +1,4 @@
-"""The recorder: writes every rollout to disk.
+"""The recorder: writes every rollout to disk, and keeps the history of the run.
 
 Actors keep a rollout until its receipt has come from the recorder as well as from the evaluator.
 The learner keeps the tutored sequences, in the same file format.
@@ -24,6 +24,7 @@ from proto.messages import Receipt, Rollout
 from proto.metrics import RecorderMetrics
 from proto.recordings.episodes import write_episode
 from proto.recordings.schemas import SceneUpdate
+from services.monitoring.run_monitor import RunMonitor
 from services.recordings import Recordings
 from services.robot_meshes import robot_meshes
 
@@ -45,6 +46,7 @@ class Recorder:
         self._lifecycle = lifecycle
         self._recordings = Recordings(config.run_folder / "rollouts", config.recorder.keep)
         self._inbox: Inbox[Rollout] = bus.inbox(bus.keys.rollout(), Rollout, capacity=WAITING)
+        self._monitor = RunMonitor(config, bus)
         self._robot = _robot()
         self._episodes = 0
         self._bytes = 0
@@ -55,7 +57,7 @@ class Recorder:
         Raises:
             StorageError: it should stop, and a rollout cannot be written to disk.
         """
-        with membership(self._bus, self, self._lifecycle):
+        with membership(self._bus, self, self._lifecycle), self._monitor.running():
             while not self._lifecycle.stopping or len(self._inbox):
                 rollout = self._inbox.take(timeout_s=0.5)
                 self._lifecycle.waits_for("" if rollout else self._missing)
@@ -99,6 +101,7 @@ class Recorder:
             self._episodes += 1
             self._bytes += path.stat().st_size
             self._recordings.add(path, episode.kind)
+            self._monitor.note(episode)
         receipt = self._bus.keys.receipt(Role.RECORDER, episode.actor)
         self._bus.deliver(receipt, Receipt(episode.id))
 

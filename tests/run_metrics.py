@@ -24,6 +24,7 @@ ACTOR = ActorMetrics(
 )  # fmt: skip
 LEARNER = LearnerMetrics(
     id="l", time_s=1.0, refused=0, stage=Stage.COUPLED, epoch=120, epochs_total=2500, loss=0.4321,
+    learning_rate=0.002, training="t-1",
     sequences=45, round=0, corrections=0, corrections_total=0, damaged=0, given_up=0,
     epochs_per_s=12.5, policy_version=3, paused=False, done=False,
 )  # fmt: skip

@@ -83,10 +83,14 @@ class Optimization:
         Raises:
             UserError: the training diverged.
         """
-        rate = self._hyperparameters.rate_at(number)
+        rate = self.rate_at(number)
         minibatches = self._minibatches(generator)
         total = sum(self._update(chosen, rate) * len(chosen) for chosen in minibatches)
         return total / len(self._objective)
+
+    def rate_at(self, number: int) -> float:
+        """Learning rate of an epoch, counted from 0."""
+        return self._hyperparameters.rate_at(number)
 
     def tensors(self) -> dict[str, Tensor]:
         """The state of the optimizer by name; see `Adam.tensors`."""

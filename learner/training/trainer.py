@@ -58,6 +58,8 @@ class Trainer:
         stage: stage of the last epoch: pre-training or coupled training; or finished.
         epochs_done: epochs done in this stage, in all its rounds.
         loss: mean loss of the last epoch, or None before the first.
+        learning_rate: learning rate of the last epoch, or None before the first of this stage and
+            after `restore`.
         version: version of the newest policy, 0 for none yet.
     """
 
@@ -65,6 +67,7 @@ class Trainer:
     stage: Stage
     epochs_done: int
     loss: float | None
+    learning_rate: float | None
     _intake: Intake
     _optimization: Optimization | None
 
@@ -191,6 +194,7 @@ class Trainer:
             raise UserError(self._intake.complaint())
         number = self.epochs_done - self._rounds.start_of(self.round)
         self.loss = loss = self._optimization.epoch(number, self.recipe.generator)
+        self.learning_rate = self._optimization.rate_at(number)
         self.epochs_done += 1
         self._finish_if_done()
         return loss
@@ -225,6 +229,7 @@ class Trainer:
         self.stage = stage
         self.epochs_done = 0
         self.loss = None
+        self.learning_rate = None
         self._intake = self._new_intake()
         self.objective = None
         self._optimization = None

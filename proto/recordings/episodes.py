@@ -69,7 +69,7 @@ STEP: Final = "/step"
 BOXES: Final = "/boxes"
 ROBOT: Final = "/robot"
 EVENTS: Final = "/events"
-_SCHEMAS: Final[Mapping[str, type[Message]]] = {
+SCHEMAS: Final[Mapping[str, type[Message]]] = {
     EYE: CompressedImage,
     CALIBRATION: CameraCalibration,
     JOINTS: JointStates,
@@ -280,7 +280,7 @@ def _contents(path: Path) -> _Contents:
 
 
 def _register(writer: Writer, topic: str) -> int:
-    schema = _SCHEMAS[topic]
+    schema = SCHEMAS[topic]
     name = schema.DESCRIPTOR.full_name
     schema_id = writer.register_schema(name, "protobuf", describe(schema))
     return writer.register_channel(topic, "protobuf", schema_id)
@@ -294,11 +294,11 @@ def _messages(episode: Episode, robot: SceneUpdate | None) -> Iterator[_Told]:
     if episode.view is not None:
         boxes = viewing.boxes(episode.view, start_ns)
         yield _Told(BOXES, 0, start_ns, boxes.SerializeToString())
-    steps = _StepMessages(episode, start_ns)
+    steps = StepMessages(episode, start_ns)
     for step in range(episode.steps):
         time_ns = start_ns + round(step * episode.control_period_s * 1e9)
         if step == 0 or episode.phases[step] != episode.phases[step - 1]:
-            begun = viewing.phase_event(episode, step, time_ns)
+            begun = viewing.phase_event(episode.phase_names[episode.phases[step]], time_ns)
             yield _Told(EVENTS, step, time_ns, begun.SerializeToString())
         for topic, data in steps.of(step, time_ns):
             yield _Told(topic, step, time_ns, data)
@@ -307,11 +307,19 @@ def _messages(episode: Episode, robot: SceneUpdate | None) -> Iterator[_Told]:
     yield _Told(EVENTS, episode.steps, end_ns, ended.SerializeToString())
 
 
-class _StepMessages:
+class StepMessages:
     """Makes the messages of one step after the other; what stays the same is made only once."""
 
-    def __init__(self, episode: Episode, start_ns: int) -> None:
+    def __init__(self, episode: Episode, start_ns: int, *, prefix: str = "") -> None:
+        """Prepare.
+
+        Args:
+            episode: the episode.
+            start_ns: when it began, Unix time (ns).
+            prefix: beginning of the names of all frames.
+        """
         self._episode = episode
+        self._prefix = prefix
         self._joints_rad = np.radians(episode.joints_deg.astype(np.float64))
         self._velocities_rad_s = viewing.velocities(self._joints_rad, episode.control_period_s)
         self._joints = JointStates()
@@ -319,22 +327,27 @@ class _StepMessages:
             self._joints.joints.add(name=name)
         self._transforms = FrameTransforms()
         for name in episode.body_names:
-            self._transforms.transforms.add(parent_frame_id=viewing.WORLD, child_frame_id=name)
+            self._transforms.transforms.add(
+                parent_frame_id=f"{prefix}{viewing.WORLD}", child_frame_id=f"{prefix}{name}"
+            )
         # Repeated fields that are serialized one after the other are one list when they are read.
-        fixed = viewing.fixed_transforms(episode.view, start_ns)
+        fixed = viewing.fixed_transforms(episode.view, start_ns, prefix=prefix)
         self._fixed_transforms = bytes(fixed.SerializeToString())
 
     def of(self, step: int, time_ns: int) -> Iterator[tuple[str, bytes]]:
         """Topic and content of each message of a step."""
         episode = self._episode
         eye = CompressedImage(
-            format="png", frame_id=viewing.CAMERA_FRAME, data=_png(episode.images[step])
+            format="png",
+            frame_id=f"{self._prefix}{viewing.CAMERA_FRAME}",
+            data=_png(episode.images[step]),
         )
         viewing.set_time(eye.timestamp, time_ns)
         yield EYE, eye.SerializeToString()
         if episode.view is not None:
             focal_px = episode.view.focal_px[step].tolist()
-            yield CALIBRATION, viewing.calibration(focal_px, time_ns).SerializeToString()
+            camera = viewing.calibration(focal_px, time_ns, prefix=self._prefix)
+            yield CALIBRATION, camera.SerializeToString()
         yield JOINTS, self._joints_of(step, time_ns)
         yield TRANSFORMS, self._transforms_of(step, time_ns)
         if episode.states is not None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
-from proto.episode import NO_FAILURE, Episode, Outcome, View
+from proto.episode import NO_FAILURE, Kind, Outcome, View
 from proto.recordings.schemas import CameraCalibration, FrameTransforms, Log, SceneUpdate
 
 WORLD: Final = "world"
@@ -53,12 +53,20 @@ def velocities(positions: NDArray[np.float64], period_s: float) -> NDArray[np.fl
     return np.asarray(np.gradient(positions, period_s, axis=0), dtype=np.float32)
 
 
-def fixed_transforms(view: View | None, time_ns: int) -> FrameTransforms:
-    """Frames that never move: the robot's fixed links, and the camera in the eye."""
+def fixed_transforms(view: View | None, time_ns: int, *, prefix: str = "") -> FrameTransforms:
+    """Frames that never move: the robot's fixed links, and the camera in the eye.
+
+    Args:
+        view: the view of the episode.
+        time_ns: Unix time (ns).
+        prefix: beginning of the names of all frames.
+    """
     transforms = FrameTransforms()
 
     def add(parent: str, name: str, pose: Sequence[float]) -> None:
-        transform = transforms.transforms.add(parent_frame_id=parent, child_frame_id=name)
+        transform = transforms.transforms.add(
+            parent_frame_id=f"{prefix}{parent}", child_frame_id=f"{prefix}{name}"
+        )
         set_time(transform.timestamp, time_ns)
         set_pose(transform, pose)
 
@@ -68,12 +76,12 @@ def fixed_transforms(view: View | None, time_ns: int) -> FrameTransforms:
     return transforms
 
 
-def calibration(focal_px: Sequence[float], time_ns: int) -> CameraCalibration:
+def calibration(focal_px: Sequence[float], time_ns: int, *, prefix: str = "") -> CameraCalibration:
     """The camera that took the picture of a step, with focal lengths (across, down) in pixels."""
     across, down = focal_px
     cx, cy = IMAGE_WIDTH / 2, IMAGE_HEIGHT / 2
     camera = CameraCalibration(
-        frame_id=CAMERA_FRAME,
+        frame_id=f"{prefix}{CAMERA_FRAME}",
         width=IMAGE_WIDTH,
         height=IMAGE_HEIGHT,
         K=[across, 0.0, cx, 0.0, down, cy, 0.0, 0.0, 1.0],
@@ -84,11 +92,11 @@ def calibration(focal_px: Sequence[float], time_ns: int) -> CameraCalibration:
     return camera
 
 
-def boxes(view: View, time_ns: int) -> SceneUpdate:
+def boxes(view: View, time_ns: int, *, prefix: str = "") -> SceneUpdate:
     """The boxes of the scene, each in the frame of its own name, which moves with it."""
     update = SceneUpdate()
     for name, look in view.boxes.items():
-        entity = update.entities.add(frame_id=name, id=name, frame_locked=True)
+        entity = update.entities.add(frame_id=f"{prefix}{name}", id=name, frame_locked=True)
         set_time(entity.timestamp, time_ns)
         cube = entity.cubes.add()
         cube.pose.orientation.w = 1.0
@@ -97,9 +105,15 @@ def boxes(view: View, time_ns: int) -> SceneUpdate:
     return update
 
 
-def phase_event(episode: Episode, step: int, time_ns: int) -> Log:
+def phase_event(phase: str, time_ns: int) -> Log:
     """Event: a phase begins."""
-    return _event("phase", episode.phase_names[episode.phases[step]], Log.INFO, time_ns)
+    return _event("phase", phase, Log.INFO, time_ns)
+
+
+def episode_event(kind: Kind, policy: str, version: int, time_ns: int) -> Log:
+    """Event: an episode begins."""
+    words = f"{kind} by {policy}" + (f" version {version}" if version else "")
+    return _event("episode", words, Log.INFO, time_ns)
 
 
 def outcome_event(outcome: Outcome, time_ns: int) -> Log:

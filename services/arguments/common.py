@@ -16,6 +16,7 @@ from proto.errors import UserError
 from proto.plain_text import plain_lines
 
 LARGEST_SEED: Final = 2**32 - 1
+LARGEST_PORT: Final = 65_535
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
@@ -51,6 +52,16 @@ def add_process(parser: argparse.ArgumentParser) -> None:
     """Add --config, --set, --connect and --id, for a process on the bus."""
     add_connection(parser)
     parser.add_argument("--id", type=_id, help="name of this process on the bus")
+
+
+def listening_address(text: str) -> tuple[str, int]:
+    """`type=` of an argument `[HOST:]PORT`; without a host, an address of this machine only."""
+    host, _, port = text.rpartition(":")
+    if not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > LARGEST_PORT:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no port; write a port such as 9464, or HOST:PORT"
+        )
+    return host.strip("[]") or "127.0.0.1", int(port)
 
 
 def config_file(name: str) -> Path:

@@ -1,4 +1,4 @@
-"""`vmdnn figure`: draw a figure of the paper, or one that shows where a policy fails."""
+"""`vmdnn figure`: draw a figure of the paper, or one of a run's training or failures."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from services.commands.figures import (
     gestures,
     memory,
     time_constants,
+    training,
     trajectories,
 )
 from services.figures.figure_result import FigureResult
@@ -42,6 +43,7 @@ FIGURES: Final[Mapping[str, FigureCommand]] = {
     "failures": failures,
     "corrections": corrections,
     "gestures": gestures,
+    "training": training,
 }
 
 

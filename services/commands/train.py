@@ -21,6 +21,7 @@ from proto.body import ARM, FOCUS, GRASP, NECK
 from proto.metrics import Stage
 from services.arguments.common import add_config, config_of
 from services.arguments.training import add_training_data, interruption, training_stores
+from services.monitoring.training_monitor import monitored
 from services.terminal.console import make_console
 
 _INTERRUPTED: Final = 130
@@ -53,10 +54,15 @@ def run(arguments: argparse.Namespace) -> int:
             f" {trainer.epochs_done}"
         )
         return 0
-    with interruption() as interrupted, _progress(trainer) as show:
+    with (
+        interruption() as interrupted,
+        _progress(trainer) as show,
+        monitored(trainer, folder) as monitor,
+    ):
 
         def go_on(loss: float) -> bool:
             show(loss)
+            monitor.note_epoch()
             return not interrupted()
 
         run_training(trainer, folder, go_on)
