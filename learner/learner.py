@@ -22,6 +22,7 @@ from learner.checkpoint import (
     training_file,
 )
 from learner.policy_message import policy_message
+from learner.training.recent_epochs import RecentEpochs
 from learner.training.training_run import (
     open_training,
     policy_is_due,
@@ -54,7 +55,7 @@ from proto.messages import (
     TutoringRequest,
     Verdict,
 )
-from proto.metrics import LARGEST_LEARNING_RATE, LearnerMetrics, Stage
+from proto.metrics import LearnerMetrics, Stage
 from proto.pace import Pace
 from proto.plain_text import plain
 from proto.players import Players
@@ -147,6 +148,7 @@ class Learner:
         for shown in found:
             self._note(shown)
         self._pace = Pace()
+        self._epochs = RecentEpochs()
 
     def run(self) -> None:
         """Learn until it should stop, then save the training.
@@ -185,8 +187,8 @@ class Learner:
             stage=self._stage,
             epoch=self._trainer.epochs_done,
             epochs_total=self._trainer.epochs_total,
-            loss=_at_most(LARGEST_LOSS, self._trainer.loss),
-            learning_rate=_at_most(LARGEST_LEARNING_RATE, self._trainer.learning_rate),
+            loss=None if self._trainer.loss is None else min(self._trainer.loss, LARGEST_LOSS),
+            learning_rate=self._epochs.learning_rate,
             training=self._run_id,
             sequences=self._sequences,
             round=self._trainer.round,
@@ -195,6 +197,7 @@ class Learner:
             damaged=self._damaged + sum(len(store.damaged) for store in self._stores.values()),
             given_up=self._given_up,
             epochs_per_s=self._pace.per_second(),
+            epochs=self._epochs.taken(),
             policy_version=self._newest_version,
             paused=self._lifecycle.paused,
             done=done.ever and self._newest_version >= (done.policy_versions or 0),
@@ -431,6 +434,7 @@ class Learner:
             if over:
                 self._write(lambda: self._trainer.save(pretraining_file(self._folder)))
         self._pace.add()
+        self._epochs.note(self._trainer)
         if policy_is_due(self._trainer):
             with self._training:
                 self._write(lambda: write_policy(self._trainer, self._folder))
@@ -474,11 +478,6 @@ class Learner:
             self._bus.keys.policy, policy_message(self._run_id, metadata, content)
         )
         LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
-
-
-def _at_most(largest: float, number: float | None) -> float | None:
-    """A number that metrics can hold."""
-    return None if number is None else min(number, largest)
 
 
 def _delete_unfinished_files(folder: Path) -> None:

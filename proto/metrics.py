@@ -28,8 +28,6 @@ Count = Annotated[int, Integer(0, 2**53)]
 Rate = Annotated[float, Number(0.0, 1e9)]
 Fraction = Annotated[float, Number(0.0, 1.0)]
 LARGEST_LEARNING_RATE: Final = 1e9
-Loss = Annotated[float | None, Maybe(Number(0.0, 1e9))]
-LearningRate = Annotated[float | None, Maybe(Number(0.0, LARGEST_LEARNING_RATE))]
 Training = Annotated[str, Text(64)]
 """Id of a training; empty for one without the bus."""
 
@@ -95,6 +93,31 @@ class Stage(StrEnum):
     FINISHED = "finished"
 
 
+MOST_EPOCHS: Final = 64
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpochMetrics:
+    """One epoch of training.
+
+    Attributes:
+        stage: pre-training or coupled training.
+        epoch: number of the epoch in its stage, from 1.
+        loss: its mean loss.
+        learning_rate: its learning rate.
+    """
+
+    stage: Stage
+    epoch: Count
+    loss: Annotated[float, Number(0.0, 1e9)]
+    learning_rate: Annotated[float, Number(0.0, LARGEST_LEARNING_RATE)]
+
+
+Epochs = Annotated[
+    tuple[EpochMetrics, ...], Many(record_of(EpochMetrics), Size("epochs", 0, MOST_EPOCHS))
+]
+
+
 @message("metrics.learner", 5, form="json")
 @dataclass(frozen=True, kw_only=True)
 class LearnerMetrics(Metrics):
@@ -118,6 +141,7 @@ class LearnerMetrics(Metrics):
         given_up: tutored cases and corrections that are no longer requested, because their
             simulation failed repeatedly; counted since the process started.
         epochs_per_s: epochs per second since the last metrics.
+        epochs: the newest epochs since the last metrics, at most MOST_EPOCHS.
         policy_version: newest published version; 0 if there is none.
         paused: whether it is paused.
         done: whether the learner's part of the configuration's `done` is reached.
@@ -127,8 +151,8 @@ class LearnerMetrics(Metrics):
     stage: Stage
     epoch: Count
     epochs_total: Count
-    loss: Loss
-    learning_rate: LearningRate
+    loss: Annotated[float | None, Maybe(Number(0.0, 1e9))]
+    learning_rate: Annotated[float | None, Maybe(Number(0.0, LARGEST_LEARNING_RATE))]
     training: Training
     sequences: Count
     round: Count
@@ -137,6 +161,7 @@ class LearnerMetrics(Metrics):
     damaged: Count
     given_up: Count
     epochs_per_s: Rate
+    epochs: Epochs = ()
     policy_version: Count
     paused: bool
     done: bool

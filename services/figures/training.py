@@ -7,14 +7,15 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import cycle
+from statistics import fmean
 from typing import Any, Final
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter
 from rich.table import Table
 
-from proto.metrics import Stage
+from proto.metrics import EpochMetrics, Stage
 from services.figures.style import (
     BLACK,
     BLUE,
@@ -34,12 +35,13 @@ from services.trials.success import READINGS, Rate
 _COLOURS: Final = (BLUE, ORANGE, GREEN, PINK, SKY, RED, BLACK)
 _MARKERS: Final = "osD^vPX"
 _COLUMNS: Final = 2
-_TRAINED: Final[Mapping[Stage, str]] = {
+_DECADE: Final = 10
+_RATES_SHOWN: Final = 60
+"""Rates are averaged over so many equal parts of the time."""
+_STAGES: Final[Mapping[Stage, str]] = {
     Stage.PRETRAINING: "pre-training",
     Stage.COUPLED: "coupled training",
-    Stage.FINISHED: "coupled training",
 }
-"""Name of the stage that an epoch belongs to; while the learner waits it is not told."""
 
 
 @dataclass
@@ -51,14 +53,12 @@ class StageCurve:
     rounds: dict[int, int] = field(default_factory=dict)
     """First sampled epoch of each round of corrections, by its number."""
 
-    def add(self, learner: LearnerSample, loss: float) -> None:
-        """Add a sample; an epoch that was computed again after a restart counts once."""
-        self.loss[learner.epoch] = loss
-        if learner.learning_rate is not None:
-            self.learning_rate[learner.epoch] = learner.learning_rate
-        if learner.round and learner.stage is not Stage.FINISHED:
-            before = self.rounds.get(learner.round, learner.epoch)
-            self.rounds[learner.round] = min(before, learner.epoch)
+    def add(self, epoch: EpochMetrics, number: int) -> None:
+        """Add an epoch of a round; one that was computed again after a restart counts once."""
+        self.loss[epoch.epoch] = epoch.loss
+        self.learning_rate[epoch.epoch] = epoch.learning_rate
+        if number:
+            self.rounds[number] = min(self.rounds.get(number, epoch.epoch), epoch.epoch)
 
 
 @dataclass
@@ -91,12 +91,13 @@ class TrainingHistory:
                 history.rates.setdefault(name, []).append((minutes, value))
             for score in sample.scores:
                 history.scores.setdefault(score.suite, {})[score.version] = score
+        history.rates = {name: _averages(points) for name, points in history.rates.items()}
         return history
 
     def _add_training(self, learner: LearnerSample | None) -> None:
-        if learner is not None and learner.loss is not None and learner.stage in _TRAINED:
-            curve = self.stages.setdefault(_TRAINED[learner.stage], StageCurve())
-            curve.add(learner, learner.loss)
+        for epoch in learner.epochs if learner else ():
+            curve = self.stages.setdefault(_STAGES[epoch.stage], StageCurve())
+            curve.add(epoch, learner.round if learner.stage is Stage.COUPLED else 0)
 
     def rates_of(self, suite: str, reading: str) -> Mapping[int, Rate]:
         """Success by policy version, in one of READINGS."""
@@ -139,22 +140,30 @@ def numbers(history: TrainingHistory) -> dict[str, Any]:
 
 
 def table(history: TrainingHistory) -> Table:
-    """Return a table of the loss of each stage and the success of each policy version."""
-    result = Table(title=f"run {history.run}", caption="success in % with the 95 % interval")
-    for heading in ("", "trials", *READINGS):
-        result.add_column(heading, justify="right" if heading else "left")
-    for name, curve in history.stages.items():
-        first, last = min(curve.loss), max(curve.loss)
-        result.add_row(
-            f"{name}, epochs {first} to {last}:"
-            f" loss {curve.loss[first]:.4g} to {curve.loss[last]:.4g}"
-        )
+    """Return a table of the success of each policy version, with the losses below it."""
+    losses = [_loss_words(name, curve) for name, curve in history.stages.items()]
+    result = Table(title=f"run {history.run}", caption="\n".join(losses))
+    result.add_column("suite")
+    for heading in ("policy", "trials", *READINGS):
+        result.add_column(heading, justify="right")
     for suite, scores in history.scores.items():
-        result.add_section()
         for version, score in sorted(scores.items()):
             rates = (Rate(getattr(score, reading), score.trials) for reading in READINGS)
-            result.add_row(f"{suite}, policy {version}", str(score.trials), *map(rate_text, rates))
+            result.add_row(
+                suite,
+                str(version),
+                str(score.trials),
+                *(rate_text(rate, digits=0) for rate in rates),
+            )
+        result.add_section()
     return result
+
+
+def _loss_words(name: str, curve: StageCurve) -> str:
+    first, last = min(curve.loss), max(curve.loss)
+    return (
+        f"{name}, epochs {first} to {last}: loss {curve.loss[first]:.4g} to {curve.loss[last]:.4g}"
+    )
 
 
 def draw(history: TrainingHistory) -> Figure:
@@ -163,11 +172,11 @@ def draw(history: TrainingHistory) -> Figure:
     rows = -(-len(panels) // _COLUMNS)
     with figure_style():
         figure = Figure(figsize=(7.2, 2.2 * rows), layout="constrained")
-        axes = figure.subplots(rows, _COLUMNS, squeeze=False).flat
-        for panel, place in zip(panels, axes, strict=False):
-            panel(place)
-        for place in list(axes)[len(panels) :]:
-            place.remove()
+        places = list(figure.subplots(rows, _COLUMNS, squeeze=False).flat)
+        for panel, axes in zip(panels, places, strict=False):
+            panel(axes)
+        for axes in places[len(panels) :]:
+            axes.remove()
         figure.suptitle(f"run {history.run}")
         return figure
 
@@ -175,8 +184,7 @@ def draw(history: TrainingHistory) -> Figure:
 def _panels(history: TrainingHistory) -> Iterator[Callable[[Axes], None]]:
     for name, curve in history.stages.items():
         yield partial(_draw_loss, name=name, curve=curve)
-        if curve.learning_rate:
-            yield partial(_draw_learning_rate, name=name, curve=curve)
+        yield partial(_draw_learning_rate, name=name, curve=curve)
     if any(history.scores.values()):
         yield partial(_draw_success, history=history)
     if any(value for points in history.rates.values() for _, value in points):
@@ -185,8 +193,8 @@ def _panels(history: TrainingHistory) -> Iterator[Callable[[Axes], None]]:
 
 def _draw_loss(axes: Axes, name: str, curve: StageCurve) -> None:
     axes.plot(*_columns(curve.loss.items()), color=BLUE)
-    if min(curve.loss.values()) > 0:
-        axes.set_yscale("log")
+    if max(curve.loss.values()) > _DECADE * min(curve.loss.values()) > 0:
+        _make_logarithmic(axes)
     _mark_rounds(axes, curve)
     _label(axes, name, "epoch", "loss")
 
@@ -201,6 +209,7 @@ def _draw_learning_rate(axes: Axes, name: str, curve: StageCurve) -> None:
 
 def _mark_rounds(axes: Axes, curve: StageCurve) -> None:
     """Draw a line where each round of corrections begins."""
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     for number, epoch in sorted(curve.rounds.items()):
         line = axes.axvline(epoch, color=GREY, linewidth=0.6, linestyle=":")
         if number == min(curve.rounds):
@@ -241,9 +250,16 @@ def _draw_rates(axes: Axes, history: TrainingHistory) -> None:
         if not any(values):  # nothing that a logarithmic axis can show
             continue
         axes.plot(minutes, [value or math.nan for value in values], label=name, color=colour)
-    axes.set_yscale("log")
+    _make_logarithmic(axes)
     axes.legend(loc="best")
     _label(axes, "rates", "time (min)", "per second")
+
+
+def _make_logarithmic(axes: Axes) -> None:
+    """Make the upward axis logarithmic, with plain numbers."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _label(axes: Axes, title: str, across: str, up: str) -> None:
@@ -270,6 +286,16 @@ def _of_newest_training(samples: Sequence[Sample]) -> Sequence[Sample]:
 
 def _training(sample: Sample) -> str:
     return "" if sample.learner is None else sample.learner.training
+
+
+def _averages(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Mean place and value of the points in each of _RATES_SHOWN equal parts."""
+    first, last = points[0][0], max(point[0] for point in points)
+    width = max((last - first) / _RATES_SHOWN, 1e-9)
+    parts: dict[int, list[tuple[float, float]]] = {}
+    for point in points:
+        parts.setdefault(int((point[0] - first) / width), []).append(point)
+    return [(fmean(p for p, _ in part), fmean(v for _, v in part)) for part in parts.values()]
 
 
 def _rates(

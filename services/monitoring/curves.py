@@ -3,21 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from proto.metrics import Stage
 from services.monitoring.event_file import EventFile
 from services.monitoring.sample import Sample, ScoreSample
-
-_STAGES: Final[Mapping[Stage, str]] = {
-    Stage.PRETRAINING: "pretraining",
-    Stage.COUPLED: "coupled",
-    Stage.FINISHED: "coupled",
-}
-"""The curve of a stage; while the learner waits, nothing is drawn."""
 
 
 class Curves:
@@ -26,7 +17,6 @@ class Curves:
     def __init__(self, events: EventFile) -> None:
         self._events = events
         self._began_s: float | None = None
-        self._trained: tuple[str, int] | None = None
         self._incomplete: dict[str, ScoreSample] = {}
 
     def add(self, sample: Sample, wanted: Mapping[str, int]) -> None:
@@ -49,16 +39,9 @@ class Curves:
             self._events.histogram(f"weights/{name}", values, step=version, time_s=time_s)
 
     def _add_training(self, sample: Sample) -> None:
-        learner = sample.learner
-        if learner is None or learner.loss is None or learner.stage not in _STAGES:
-            return
-        stage = _STAGES[learner.stage]
-        if self._trained == (stage, learner.epoch):
-            return
-        self._trained = (stage, learner.epoch)
-        self._scalar(f"loss/{stage}", learner.loss, learner.epoch, sample)
-        if learner.learning_rate is not None:
-            self._scalar(f"learning_rate/{stage}", learner.learning_rate, learner.epoch, sample)
+        for epoch in sample.learner.epochs if sample.learner else ():
+            for name, value in (("loss", epoch.loss), ("learning_rate", epoch.learning_rate)):
+                self._scalar(f"{name}/{epoch.stage}", value, epoch.epoch, sample)
 
     def _add_rates(self, sample: Sample) -> None:
         if self._began_s is None:

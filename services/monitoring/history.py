@@ -16,6 +16,7 @@ from typing import Final
 
 from proto.codec import MEBIBYTE, MessageError
 from proto.errors import UserError
+from proto.metrics import EpochMetrics
 from proto.storage import append_line, drop_unfinished_line, written_whole
 from services.monitoring.sample import Sample, ScoreSample
 
@@ -127,9 +128,12 @@ class History:
 
 
 def _one_each(samples: Iterable[Sample], slot: Callable[[float], int]) -> Iterator[Sample]:
-    """Yield the last sample of each slot of time, with the scores of all of them."""
+    """Yield a sample for each slot of time: the last, with the scores of all and one epoch."""
     for _, group in groupby(samples, lambda sample: slot(sample.time_s)):
         scores: dict[tuple[str, int], ScoreSample] = {}
+        epochs: tuple[EpochMetrics, ...] = ()
         for sample in group:
             scores |= {(score.suite, score.version): score for score in sample.scores}
-        yield replace(sample, scores=tuple(scores.values())[-_SCORES_KEPT:])
+            epochs = (sample.learner.epochs if sample.learner else ())[-1:] or epochs
+        learner = None if sample.learner is None else replace(sample.learner, epochs=epochs)
+        yield replace(sample, learner=learner, scores=tuple(scores.values())[-_SCORES_KEPT:])

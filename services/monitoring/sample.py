@@ -23,9 +23,8 @@ from proto.codec import (
 from proto.metrics import (
     ActorMetrics,
     Count,
+    Epochs,
     LearnerMetrics,
-    LearningRate,
-    Loss,
     Rate,
     Stage,
     SuiteScore,
@@ -46,9 +45,7 @@ class LearnerSample:
     training: Training
     stage: Stage
     round: Count
-    epoch: Count
-    loss: Loss
-    learning_rate: LearningRate
+    epochs: Epochs
     epochs_per_s: Rate
     sequences: Count
     policy_version: Count
@@ -190,9 +187,7 @@ def _learner_sample(learner: LearnerMetrics) -> LearnerSample:
         training=learner.training,
         stage=learner.stage,
         round=learner.round,
-        epoch=learner.epoch,
-        loss=learner.loss,
-        learning_rate=learner.learning_rate,
+        epochs=learner.epochs,
         epochs_per_s=learner.epochs_per_s,
         sequences=learner.sequences,
         policy_version=learner.policy_version,

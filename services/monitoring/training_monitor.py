@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from learner.checkpoint import NETWORK_PREFIX, load_checkpoint, policy_file
+from learner.training.recent_epochs import RecentEpochs
 from learner.training.trainer import Trainer
 from proto.errors import UserError
-from proto.messages import LARGEST_LOSS
-from proto.metrics import LARGEST_LEARNING_RATE, Stage
 from proto.pace import Pace
 from proto.storage import StorageError
 from services.monitoring.curves import Curves
@@ -23,7 +22,7 @@ from services.monitoring.sample import LearnerSample, Sample
 
 LOG = logging.getLogger(__name__)
 
-PERIOD_S: Final = 0.1
+PERIOD_S: Final = 0.25
 """Least time between two samples at first."""
 FLUSH_S: Final = 10.0
 
@@ -39,12 +38,14 @@ class TrainingMonitor:
         self._curves = Curves(self._events)
         self._version = trainer.version
         self._pace = Pace()
+        self._epochs = RecentEpochs()
         self._flushed_s = time.monotonic()
         self._told = False
 
     def note_epoch(self) -> None:
         """Note that an epoch is done."""
         self._pace.add()
+        self._epochs.note(self._trainer)
         now_s = time.time()
         stage_ends = self._trainer.epochs_done >= self._trainer.epochs_total
         if self._history.is_due(now_s) or stage_ends:
@@ -84,20 +85,16 @@ class TrainingMonitor:
 
     def _sample(self, now_s: float) -> Sample:
         trainer = self._trainer
-        return Sample(
-            time_s=now_s,
-            learner=LearnerSample(
-                training="",
-                stage=Stage.COUPLED if trainer.finished else trainer.stage,
-                round=0,
-                epoch=trainer.epochs_done,
-                loss=min(trainer.loss or 0.0, LARGEST_LOSS),
-                learning_rate=min(trainer.learning_rate or 0.0, LARGEST_LEARNING_RATE),
-                epochs_per_s=self._pace.per_second(),
-                sequences=trainer.sequences,
-                policy_version=trainer.version,
-            ),
+        learner = LearnerSample(
+            training="",
+            stage=trainer.stage,
+            round=0,
+            epochs=self._epochs.taken(),
+            epochs_per_s=self._pace.per_second(),
+            sequences=trainer.sequences,
+            policy_version=trainer.version,
         )
+        return Sample(time_s=now_s, learner=learner)
 
 
 @contextmanager

@@ -6,21 +6,27 @@ import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from fitting import settings_digest
+from fitting import make_policy, settings_digest
 from ports import free_endpoint
 from processes import eventually, stop, vmdnn
+from run_metrics import ACTOR, EVALUATOR, LEARNER
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from learner.checkpoint import checkpoint_from_bytes
 from proto.bus import Bus, open_bus, open_hub
 from proto.config import HubConfig
 from proto.episode import Episode, Kind
 from proto.keys import Role
 from proto.messages import Receipt, Rollout
-from proto.metrics import RecorderMetrics
+from proto.metrics import EpochMetrics, RecorderMetrics, Stage
+from proto.periodic import every
 from proto.recordings.episodes import read_episode
+from services.monitoring.history import history_file, read_history
 
 MakeEpisode = Callable[..., Episode]
 
@@ -131,3 +137,55 @@ def test_a_restarted_recorder_continues_and_can_keep_trials_only(
                 process.wait()
                 listener.forget()
     assert files(tmp_path) == ["before.mcap", "during0.mcap", "during1.mcap"]
+
+
+def test_the_history_of_the_run_is_kept(
+    hub: HubConfig, rollout: Callable[..., Rollout], tmp_path: Path
+) -> None:
+    """Loss, rates, success, the weights of a policy and the pictures of a failure."""
+    folder = tmp_path / RUN
+    epoch = EpochMetrics(stage=Stage.COUPLED, epoch=120, loss=0.5, learning_rate=0.001)
+    learner = replace(LEARNER, epochs=(epoch,))
+    with (
+        open_bus(hub, RUN, Role.ACTOR, "a-1") as actor,
+        open_bus(hub, RUN, Role.LEARNER, "l") as learning,
+        open_bus(hub, RUN, Role.EVALUATOR, "e") as evaluating,
+    ):
+        for bus in (actor, learning, evaluating):
+            bus.announce()
+        policy = make_policy(3, "t-1")
+        learning.publish_newest(learning.keys.policy, policy)
+        tell = {
+            actor: ACTOR,
+            learning: learner,
+            evaluating: EVALUATOR,
+        }
+
+        def publish() -> None:
+            for bus, metrics in tell.items():
+                bus.publish(bus.keys.metrics(bus.role, bus.id), metrics)
+
+        for number in range(2):
+            with recorder(hub, tmp_path) as process, every(0.2, publish):
+                listener = Listener(actor)
+                listener.wait_for(lambda metrics: metrics.episodes == 0)
+                actor.deliver(actor.keys.rollout("actor"), rollout(f"failed{number}", number))
+                listener.wait_for(lambda metrics: metrics.episodes == 1)
+                assert stop(process) == 0
+    past = read_history(history_file(folder))
+    assert past.damaged == 0
+    told = [sample for sample in past.samples if sample.learner and sample.actors]
+    assert told[-1].learner is not None
+    assert told[-1].learner.training == "t-1"
+    assert epoch in told[-1].learner.epochs
+    assert told[-1].actors is not None
+    assert told[-1].actors.steps_per_s == 81.25
+    scores = {(s.suite, s.version): s.strict for sample in past.samples for s in sample.scores}
+    assert scores == {("unlearned", 2): 3, ("unlearned", 3): 44}
+    found = EventAccumulator(str(folder / "tensorboard"))
+    found.Reload()
+    tags = found.Tags()
+    assert {"loss/coupled", "rates/steps_per_s", "success_unlearned/strict"} <= {*tags["scalars"]}
+    assert len(tags["histograms"]) == len(checkpoint_from_bytes(policy.weights, "").tensors)
+    assert {event.step for event in found.Histograms(tags["histograms"][0])} == {3}
+    assert found.Images("failure/unlearned")[0].width == 192

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from learner.checkpoint import load_checkpoint, policy_file, pretraining_file, training_file
 from learner.training.trainer import Trainer
@@ -77,6 +78,24 @@ def test_it_writes_policies_a_checkpoint_and_the_config(
 
     assert train(out) == 0
     assert "is trained already" in capsys.readouterr().out
+
+
+def test_it_keeps_a_history(
+    tmp_path: Path, train: Callable[..., int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(out) == 0
+    capsys.readouterr()
+    assert main(["figure", "training", str(out), "--json", "--out", str(tmp_path / "f.png")]) == 0
+    stages = json.loads(capsys.readouterr().out)["stages"]
+    assert [stage["loss"][-1][0] for stage in stages.values()] == [2, 6]  # the last epochs
+    found = EventAccumulator(str(out / "tensorboard"))
+    found.Reload()
+    tags = found.Tags()
+    assert {"loss/pretraining", "loss/coupled", "learning_rate/coupled"} <= set(tags["scalars"])
+    assert len(tags["histograms"]) > 10
+    for name in tags["histograms"]:
+        assert [event.step for event in found.Histograms(name)] == [1, 2, 3], name
 
 
 def test_the_representation_of_the_vision_can_be_inspected(
