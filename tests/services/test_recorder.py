@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fitting import make_policy, settings_digest
+from outcomes import TOUCHED
 from ports import free_endpoint
 from processes import eventually, stop, vmdnn
 from run_metrics import ACTOR, EVALUATOR, LEARNER
@@ -169,7 +170,9 @@ def test_the_history_of_the_run_is_kept(
             with recorder(hub, tmp_path) as process, every(0.2, publish):
                 listener = Listener(actor)
                 listener.wait_for(lambda metrics: metrics.episodes == 0)
-                actor.deliver(actor.keys.rollout("actor"), rollout(f"failed{number}", number))
+                played = rollout(f"failed{number}", number)
+                failed = replace(played.episode, outcome=TOUCHED)
+                actor.deliver(actor.keys.rollout("actor"), replace(played, episode=failed))
                 listener.wait_for(lambda metrics: metrics.episodes == 1)
                 assert stop(process) == 0
     past = read_history(history_file(folder))
