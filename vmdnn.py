@@ -102,6 +102,9 @@ def load_config(source: str | Path | None = None, overrides: Sequence[str] = ())
             or None for all defaults.
         overrides: values to change, such as `learner.epochs=10`.
 
+    Returns:
+        The configuration; its sections are attributes, such as `config.learner.epochs`.
+
     Raises:
         UserError: there is no such file, or a value is wrong.
     """
@@ -118,6 +121,13 @@ def make_task(name: str = "experiment1", **options: Any) -> Task:
         name: name of a built-in task, or your own class as `package.module:Class`.
         options: the other keys of the section `task` of a configuration, such as
             attention="fixed".
+
+    Returns:
+        The task. `tutored()` gives its tutored situations, `variables` what a situation consists
+        of, `phase_names` its phases.
+
+    Raises:
+        UserError: there is no such task, or it has no such option.
     """
     from actors.tasks.registry import make_task as make  # noqa: PLC0415
     from proto.config import TaskConfig  # noqa: PLC0415
@@ -132,6 +142,12 @@ def make_simulator(backend: str = "sapien", *, render: bool = True) -> Simulator
         backend: name of a built-in simulator, or your own class as `package.module:Class`.
         render: render pictures. Without it every picture is black, and no graphics driver is
             needed.
+
+    Returns:
+        The simulator. It can play any number of episodes, one after the other; `close()` ends it.
+
+    Raises:
+        UserError: there is no such simulator, or it cannot render on this machine.
     """
     from actors.simulator import make_simulator as make  # noqa: PLC0415
     from proto.config import SimulatorConfig  # noqa: PLC0415
@@ -147,6 +163,13 @@ def make_policy(name: str | Path, task: Task) -> Policy:
             own class as `package.module:Class`. Before it may stand the name of one of
             `task.blinded`, as in `blank-screen:pretrained:NAME`.
         task: the task.
+
+    Returns:
+        The policy, for `play`. A trained network also has `states(images)`: the activity
+        (steps, units) of each subnet by name, for pictures (steps, 48, 64) uint8.
+
+    Raises:
+        UserError: there is no such policy, or it is damaged or of another task.
     """
     from actors.policies.by_name import make_policy as make  # noqa: PLC0415
 
@@ -169,6 +192,12 @@ def play(
         policy: policy that chooses the actions.
         situation: values of the task's variables by name; without it, a random situation.
         seed: seed of all random numbers in the episode, including the random situation.
+
+    Returns:
+        The episode: pictures, actions, joints, bodies and `outcome`; see `help(vmdnn.Episode)`.
+
+    Raises:
+        UserError: the situation is not one of the task.
     """
     from actors.player import play as play_episode  # noqa: PLC0415
     from proto.episode import Kind  # noqa: PLC0415
@@ -178,14 +207,32 @@ def play(
 
 
 def read_episode(path: str | Path) -> Episode:
-    """Read a recorded episode, an MCAP file."""
+    """Read a recorded episode.
+
+    Args:
+        path: the MCAP file.
+
+    Returns:
+        The episode, equal to the one that was recorded.
+
+    Raises:
+        UserError: the file is missing, damaged or no episode.
+    """
     from proto.recordings.episodes import read_episode as read  # noqa: PLC0415
 
     return read(Path(path))
 
 
 def write_episode(path: str | Path, episode: Episode) -> None:
-    """Record an episode as an MCAP file."""
+    """Record an episode as an MCAP file, which Foxglove opens.
+
+    Args:
+        path: the file. An existing one is replaced.
+        episode: the episode.
+
+    Raises:
+        UserError: the file cannot be written.
+    """
     from proto.recordings.episodes import write_episode as write  # noqa: PLC0415
     from services.robot_meshes import robot_meshes  # noqa: PLC0415
 
@@ -212,6 +259,9 @@ def tutor(
 
     Returns:
         The files of the folder.
+
+    Raises:
+        UserError: there is no such case, or the folder cannot be written.
     """
     from actors.tasks.registry import make_task as make  # noqa: PLC0415
     from proto.config import Config as Default  # noqa: PLC0415
@@ -236,10 +286,14 @@ def train(
         data: folder of tutored sequences.
         out: folder of the run, for checkpoints and policies.
         config: the configuration; without it, all defaults.
-        on_epoch: called with the loss after each epoch.
+        on_epoch: called with the loss after each epoch, of pre-training too.
 
     Returns:
         The file of the newest policy.
+
+    Raises:
+        UserError: there is no sequence to learn from, the folder holds a training of another
+            network, or the training diverged.
     """
     from actors.tasks.registry import make_task as make  # noqa: PLC0415
     from learner.checkpoint import policy_file  # noqa: PLC0415
@@ -285,6 +339,14 @@ def evaluate(
         workers: number of processes.
         suite: name of a suite of the configuration or of a built-in one, such as `disturbed`, in
             whose simulator and under whose conditions the trials are played.
+
+    Returns:
+        The counts. `tally.rate("strict")` gives successes, rate and 95 % Wilson interval in a
+        reading of success (`lenient`, `strict`, `precise`), `tally.reasons` how often trials failed
+        for which reason.
+
+    Raises:
+        UserError: there is no such policy or suite.
     """
     from proto.config import Config as Default  # noqa: PLC0415
     from services.playing.workers import play_all  # noqa: PLC0415

@@ -22,7 +22,7 @@ from actors.receipts import Receipts
 from actors.simulator import make_simulator, player_of
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
-from actors.view import view_of
+from actors.view import focal_lengths, view_of
 from learner.checkpoint import Checkpoint
 from learner.network_policy import NetworkPolicy
 from learner.policy_message import policy_of
@@ -37,9 +37,11 @@ from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import membership
 from proto.messages import (
+    LIVE_SCENE_EVERY,
     Correction,
     EpisodeFailed,
     Live,
+    LiveScene,
     PolicyVersion,
     Rollout,
     Sequence,
@@ -124,10 +126,15 @@ def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
         image=live.image,
         joints_deg=live.joints_deg.astype(np.float32),
         action=live.action.astype(np.float32),
-        body_names=tuple(live.bodies.places),
         body_poses=live.bodies.rows.astype(np.float32),
-        view=view_of(live.scene, [live.crop]),
+        focal_px=focal_lengths(live.crop),
+        scene=_live_scene(live) if live.step % LIVE_SCENE_EVERY == 0 else None,
     )
+
+
+def _live_scene(live: LiveStep) -> LiveScene:
+    view = view_of(live.scene, [])
+    return LiveScene(tuple(live.bodies.places), view.boxes, view.fixed_links)
 
 
 class _StoppedError(Exception):

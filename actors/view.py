@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from actors.backends.eye import eye_focal_lengths
@@ -25,14 +26,18 @@ def view_of(scene: Scene, crops: Sequence[Crop]) -> View:
         crops: the part of the eye image that was seen in each control step.
     """
     rise = np.array([0.0, 0.0, scene.table_drop_m, 0.0, 0.0, 0.0, 0.0])
-    focal = [eye_focal_lengths(crop, IMAGE_WIDTH, IMAGE_HEIGHT) for crop in crops]
     return View(
         boxes={box.name: BoxLook(box.size_m, box.colour) for box in scene.boxes},
         fixed_links={
             link: (pose + rise).astype(np.float32) for link, pose in _fixed_links().items()
         },
-        focal_px=np.array(focal, dtype=np.float32).reshape(-1, 2),
+        focal_px=np.array([focal_lengths(crop) for crop in crops], np.float32).reshape(-1, 2),
     )
+
+
+def focal_lengths(crop: Crop) -> NDArray[np.float32]:
+    """Focal lengths (2,), across and down, of the picture that shows a crop (pixels)."""
+    return np.array(eye_focal_lengths(crop, IMAGE_WIDTH, IMAGE_HEIGHT), np.float32)
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, Final
@@ -9,12 +10,14 @@ from typing import Annotated, Final
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.codec import (
     MEBIBYTE,
+    Added,
     Array,
     Blob,
     Integer,
     Many,
     Number,
     Size,
+    Table,
     Text,
     message,
     record_of,
@@ -23,6 +26,7 @@ from proto.episode import (
     BODIES,
     JOINTS,
     LARGEST_DEG,
+    BoxLook,
     ConditionsField,
     Episode,
     Floats,
@@ -30,7 +34,6 @@ from proto.episode import (
     Image,
     Kind,
     Outcome,
-    View,
 )
 from proto.keys import Role
 from proto.seeds import SEEDS_PER_CASE
@@ -295,6 +298,25 @@ class Settings:
     values: Annotated[tuple[Setting, ...], Many(record_of(Setting), Size("values", 0, 1000))]
 
 
+LIVE_SCENE_EVERY: Final = 10
+"""The first of so many control steps carries the scene, for viewers that begin to look."""
+
+
+@dataclass(frozen=True)
+class LiveScene:
+    """What viewers need of an episode, and what stays the same in it.
+
+    Attributes:
+        body_names: names of the B bodies.
+        boxes: as in `proto.episode.View`.
+        fixed_links: as in `proto.episode.View`.
+    """
+
+    body_names: Annotated[tuple[str, ...], Many(Text(64), BODIES)]
+    boxes: Annotated[Mapping[str, BoxLook], Table(record_of(BoxLook), most=256)]
+    fixed_links: Annotated[Mapping[str, Floats], Table(Array("float32", (7,), -1e3, 1e3), most=256)]
+
+
 @message("live", 4)
 @dataclass(frozen=True)
 class Live:
@@ -310,10 +332,10 @@ class Live:
         image: (48, 64) uint8, the network's grey picture.
         joints_deg: (18,) float32, neck, arm and hand as measured.
         action: (11,) float32, the commanded action.
-        body_names: names of the B bodies.
-        body_poses: (B, 7) float32, position (m) and quaternion (w first) in the world frame, at
-            the same time as the picture.
-        view: what a viewer needs besides, of this step alone.
+        body_poses: (B, 7) float32, position (m) and quaternion (w first) of each body in the world
+            frame, at the same time as the picture.
+        focal_px: (2,) float32, as in `proto.episode.View`.
+        scene: what does not change in an episode; None in most messages.
     """
 
     actor: Id
@@ -325,14 +347,9 @@ class Live:
     image: Annotated[Image, Array("uint8", (IMAGE_HEIGHT, IMAGE_WIDTH))]
     joints_deg: Annotated[Floats, Array("float32", (JOINTS,), -LARGEST_DEG, LARGEST_DEG)]
     action: Annotated[Floats, Array("float32", (ACTION_SIZE,), -LARGEST_DEG, LARGEST_DEG)]
-    body_names: Annotated[tuple[str, ...], Many(Text(64), BODIES)]
     body_poses: Annotated[Floats, Array("float32", (BODIES, 7), -1e3, 1e3)]
-    view: View
-
-    def __post_init__(self) -> None:
-        """Raise ValueError if the view is not that of one step."""
-        if len(self.view.focal_px) != 1:
-            raise ValueError(f"view: expected that of 1 step, got {len(self.view.focal_px)}")
+    focal_px: Annotated[Floats, Array("float32", (2,), 1e-3, 1e6)]
+    scene: Annotated[LiveScene | None, Added(record_of(LiveScene))] = None
 
 
 class Command(StrEnum):

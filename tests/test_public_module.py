@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,7 +17,15 @@ import vmdnn
 from services.cli import main
 
 ROOT = Path(__file__).parents[1]
-BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
+
+
+def blocks(document: str) -> list[str]:
+    """The Python code blocks of a document."""
+    text = (ROOT / "docs" / document).read_text()
+    return re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
+
+
+BLOCKS = blocks("python.md")
 
 
 @pytest.mark.parametrize("number", range(len(BLOCKS)))
@@ -24,6 +35,22 @@ def test_each_code_block_of_the_page_runs_alone(
     assert len(BLOCKS[number].splitlines()) < 20
     monkeypatch.chdir(tmp_path)
     exec(compile(BLOCKS[number], f"docs/python.md, block {number}", "exec"), {})
+
+
+def test_the_cells_of_the_notebook_run_in_their_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    cells = blocks("notebook.md")
+    assert len(cells) == 5
+    names: dict[str, Any] = {}
+    for number, cell in enumerate(cells):
+        assert len(cell.splitlines()) < 20
+        exec(compile(cell, f"docs/notebook.md, cell {number}", "exec"), names)
+    assert len(names["losses"]) == 12
+    assert names["tally"].trials == 2
+    assert names["tally"].rate("lenient").successes > 0  # of the trained policy
 
 
 def test_a_users_policy_is_found_by_name(
@@ -39,10 +66,24 @@ def test_a_users_policy_is_found_by_name(
     assert "it lacks: step" in capsys.readouterr().err
 
 
+def check_help(function: Callable[..., Any]) -> None:
+    """Check that `help` shows types, and explains each argument and what is returned."""
+    signature = inspect.signature(function)
+    assert signature.return_annotation is not inspect.Signature.empty
+    text = inspect.getdoc(function) or ""
+    for name, parameter in signature.parameters.items():
+        assert parameter.annotation is not inspect.Parameter.empty, name
+        assert re.search(rf"^    {name}: ", text, flags=re.MULTILINE), f"{function}: {name}"
+    assert signature.return_annotation == "None" or "Returns:" in text, function
+    assert "Raises:" in text, function
+
+
 def test_every_public_name_exists_and_is_documented() -> None:
     for name in vmdnn.__all__:
         thing = getattr(vmdnn, name)
         assert name == "__version__" or thing.__doc__, name
+        if inspect.isfunction(thing):
+            check_help(thing)
     assert vmdnn.__version__ == version("vmdnn")
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = vmdnn.nothing

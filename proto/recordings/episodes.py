@@ -292,7 +292,7 @@ def _messages(episode: Episode, robot: SceneUpdate | None) -> Iterator[_Told]:
     if robot is not None:
         yield _Told(ROBOT, 0, start_ns, robot.SerializeToString())
     if episode.view is not None:
-        boxes = viewing.boxes(episode.view, start_ns)
+        boxes = viewing.boxes(episode.view.boxes, start_ns)
         yield _Told(BOXES, 0, start_ns, boxes.SerializeToString())
     steps = StepMessages(episode, start_ns)
     for step in range(episode.steps):

@@ -6,14 +6,14 @@ in the frame `l_eye`: x to the right of the picture, y down, z along the optical
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
-from proto.episode import NO_FAILURE, Kind, Outcome, View
+from proto.episode import NO_FAILURE, BoxLook, Kind, Outcome, View
 from proto.recordings.schemas import CameraCalibration, FrameTransforms, Log, SceneUpdate
 
 WORLD: Final = "world"
@@ -92,10 +92,10 @@ def calibration(focal_px: Sequence[float], time_ns: int, *, prefix: str = "") ->
     return camera
 
 
-def boxes(view: View, time_ns: int, *, prefix: str = "") -> SceneUpdate:
+def boxes(looks: Mapping[str, BoxLook], time_ns: int, *, prefix: str = "") -> SceneUpdate:
     """The boxes of the scene, each in the frame of its own name, which moves with it."""
     update = SceneUpdate()
-    for name, look in view.boxes.items():
+    for name, look in looks.items():
         entity = update.entities.add(frame_id=f"{prefix}{name}", id=name, frame_locked=True)
         set_time(entity.timestamp, time_ns)
         cube = entity.cubes.add()

@@ -28,7 +28,7 @@ from proto.episode import UNKNOWN_OUTCOME, Episode, View
 from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
-from proto.messages import Live
+from proto.messages import Live, LiveScene
 from proto.recordings import viewing
 from proto.recordings.episodes import (
     BOXES,
@@ -108,6 +108,7 @@ class _Stage:
             for topic, shown in self.topics.items()
         }
         self._before: Live | None = None
+        self._scene: LiveScene | None = None
 
     def close(self) -> None:
         """Withdraw the topics."""
@@ -122,15 +123,21 @@ class _Stage:
             time_ns: when it was played, Unix time (ns).
         """
         before, self._before = self._before, live
-        begins = before is None or live.step <= before.step
-        if begins:
-            self._send_boxes(live, time_ns)
+        if live.scene is not None:
+            known, self._scene = self._scene, live.scene
+            if known is None or known.boxes != live.scene.boxes:
+                self._send_boxes(time_ns)
+        scene = self._scene
+        if scene is None or len(scene.body_names) != len(live.body_poses):
+            return  # it comes soon
+        if before is None or live.step <= before.step:
+            before = live
             event = viewing.episode_event(live.kind, live.policy, live.policy_version, time_ns)
             self._send(EVENTS, event.SerializeToString(), time_ns)
-        if before is None or begins or live.phase != before.phase:
+        if before is live or live.phase != before.phase:
             phase = viewing.phase_event(live.phase, time_ns)
             self._send(EVENTS, phase.SerializeToString(), time_ns)
-        episode = _short_episode(live if before is None or begins else before, live, self._period_s)
+        episode = _short_episode(before, live, scene, self._period_s)
         messages = StepMessages(episode, time_ns, prefix=self._prefix)
         for topic, data in messages.of(episode.steps - 1, time_ns):
             told = _step(live).SerializeToString() if topic == STEP else data
@@ -144,11 +151,13 @@ class _Stage:
             for entity in shown.entities:
                 entity.frame_id = f"{self._prefix}{entity.frame_id}"
             self._send(ROBOT, shown.SerializeToString(), time.time_ns())
-        elif topic == BOXES and self._before is not None:
-            self._send_boxes(self._before, time.time_ns())
+        elif topic == BOXES:
+            self._send_boxes(time.time_ns())
 
-    def _send_boxes(self, live: Live, time_ns: int) -> None:
-        update = viewing.boxes(live.view, time_ns, prefix=self._prefix)
+    def _send_boxes(self, time_ns: int) -> None:
+        if self._scene is None:
+            return
+        update = viewing.boxes(self._scene.boxes, time_ns, prefix=self._prefix)
         everything = update.deletions.add(type=_DELETE_ALL)  # boxes of the episode before
         viewing.set_time(everything.timestamp, time_ns - 1)
         self._send(BOXES, update.SerializeToString(), time_ns)
@@ -287,7 +296,7 @@ class LiveView:
             self._main.show(live, time_ns)
 
 
-def _short_episode(before: Live, live: Live, period_s: float) -> Episode:
+def _short_episode(before: Live, live: Live, scene: LiveScene, period_s: float) -> Episode:
     """The episode that consists of two steps, or of one if both are the same.
 
     Velocities are the differences of the joints in the two steps.
@@ -312,14 +321,14 @@ def _short_episode(before: Live, live: Live, period_s: float) -> Episode:
         joints_deg=np.stack([step.joints_deg for step in steps]),
         phase_names=(live.phase,),
         phases=np.zeros(len(steps), np.uint8),
-        body_names=live.body_names,
+        body_names=scene.body_names,
         body_poses=np.stack([live.body_poses] * len(steps)),
         outcome=UNKNOWN_OUTCOME,
         control_period_s=passed_s,
         view=View(
-            live.view.boxes,
-            live.view.fixed_links,
-            np.concatenate([live.view.focal_px] * len(steps)),
+            scene.boxes,
+            scene.fixed_links,
+            np.stack([live.focal_px] * len(steps)),
         ),
     )
 

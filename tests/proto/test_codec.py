@@ -25,11 +25,12 @@ from proto.codec import (
     record_of,
     schema_of,
 )
-from proto.episode import BoxLook, Episode, Kind, View
+from proto.episode import BoxLook, Episode, Kind
 from proto.messages import (
     Command,
     Control,
     Live,
+    LiveScene,
     PolicyVersion,
     Receipt,
     Rollout,
@@ -151,17 +152,17 @@ def test_a_live_step_is_decoded_unchanged() -> None:
         image=random.integers(0, 256, (48, 64), dtype=np.uint8),
         joints_deg=random.uniform(-90, 90, 18).astype(np.float32),
         action=random.uniform(-90, 90, 11).astype(np.float32),
-        body_names=("object", "l_eye"),
         body_poses=random.uniform(-1, 1, (2, 7)).astype(np.float32),
-        view=View(
-            {"object": BoxLook((0.1, 0.2, 0.3), (1.0, 0.0, 0.5))},
-            {"chest": random.uniform(-1, 1, 7).astype(np.float32)},
-            np.array([[50.0, 60.0]], np.float32),
-        ),
+        focal_px=np.array([50.0, 60.0], np.float32),
     )
     assert same(decode(encode(sent), Live), sent)
-    with pytest.raises(ValueError, match="expected that of 1 step, got 2"):
-        replace(sent, view=replace(sent.view, focal_px=np.ones((2, 2), np.float32)))
+    scene = LiveScene(
+        ("object", "l_eye"),
+        {"object": BoxLook((0.1, 0.2, 0.3), (1.0, 0.0, 0.5))},
+        {"chest": random.uniform(-1, 1, 7).astype(np.float32)},
+    )
+    sent = replace(sent, scene=scene)
+    assert same(decode(encode(sent), Live), sent)
 
 
 @given(length=st.floats(0, 1, exclude_max=True))

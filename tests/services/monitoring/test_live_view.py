@@ -223,7 +223,7 @@ def test_a_viewer_sees_what_a_recording_would_show(hub: HubConfig, lives: list[L
         _check_joints(got["/joints"], steps, lives)
         _check_scene(got, lives[0])
         camera = CameraCalibration.FromString(got["/eye/calibration"][0])
-        assert (camera.K[0], camera.K[4]) == tuple(lives[steps[0].step].view.focal_px[0])
+        assert (camera.K[0], camera.K[4]) == tuple(lives[steps[0].step].focal_px)
         events = [Log.FromString(data) for data in got["/events"]]
         assert "tutoring by tutor" in {event.message for event in events}
         assert lives[0].phase in {event.message for event in events}
@@ -255,8 +255,9 @@ def _check_scene(got: dict[str, list[bytes]], live: Live) -> None:
         for entity in robot.entities:
             assert parents[entity.frame_id] == f"{prefix}world"
         assert parents[f"{prefix}l_eye_optical"] == f"{prefix}l_eye"
+    assert live.scene is not None
     boxes = SceneUpdate.FromString(got["/boxes"][0])
-    assert {entity.id for entity in boxes.entities} == set(live.view.boxes)
+    assert {entity.id for entity in boxes.entities} == set(live.scene.boxes)
     assert len(boxes.deletions) == 1
 
 
