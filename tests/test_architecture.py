@@ -27,6 +27,7 @@ ONLY_IN = {
 
 MAY_WRITE = {
     "services/playing/video_file.py": "a video in a temporary folder, which storage then copies",
+    "services/monitoring/event_file.py": "a video in memory",
     "proto/storage.py": "all writing goes through it",
     "proto/run_locks.py": "an empty file that is locked; nothing is kept in it",
     "sim_assets/icub_visuals.py": "a cache, built in a folder that is renamed when it is complete",

@@ -37,6 +37,7 @@ def test_each_code_block_of_the_page_runs_alone(
     exec(compile(BLOCKS[number], f"docs/python.md, block {number}", "exec"), {})
 
 
+@pytest.mark.slow
 def test_the_cells_of_the_notebook_run_in_their_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

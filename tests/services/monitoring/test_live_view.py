@@ -192,7 +192,12 @@ def topics_of_layout() -> set[str]:
 
 
 def test_a_viewer_sees_what_a_recording_would_show(hub: HubConfig, lives: list[Live]) -> None:
-    with serving(hub) as server, acting(hub, lives) as bus, server.viewer() as viewer:
+    with (
+        serving(hub) as server,
+        acting(hub, lives) as bus,
+        server.viewer() as viewer,
+        server.viewer() as slow,
+    ):
         key = bus.keys.live("a-1")
         viewer.wait_for_topics("/actors/a-1/events")
         assert topics_of_layout() <= viewer.channels.keys()
@@ -207,13 +212,14 @@ def test_a_viewer_sees_what_a_recording_would_show(hub: HubConfig, lives: list[L
             "/robot",
             "/events",
         )
+        slow.subscribe(*shown)  # and reads nothing from now on
         viewer.subscribe(*shown, "/actors/a-1/tf", "/actors/a-1/robot")
         viewer.wait_for(
-            lambda: viewer.count("/step") >= 25 and viewer.count("/actors/a-1/robot") > 0
+            lambda: viewer.count("/step") >= 50 and viewer.count("/actors/a-1/robot") > 0
         )
         got = viewer.received
         steps = [Step.FromString(data) for data in got["/step"]]
-        assert {step.step for step in steps} > {5, 6, 7}
+        assert len({step.step for step in steps}) >= len(lives) / 2
         for step, data in zip(steps, got["/eye"], strict=False):
             live = lives[step.step]
             png = np.frombuffer(CompressedImage.FromString(data).data, dtype=np.uint8)
@@ -228,6 +234,7 @@ def test_a_viewer_sees_what_a_recording_would_show(hub: HubConfig, lives: list[L
         assert "tutoring by tutor" in {event.message for event in events}
         assert lives[0].phase in {event.message for event in events}
         viewer.unsubscribe_all()
+        slow.unsubscribe_all()
         eventually(lambda: not bus.watched(key), "the actor is not listened to any more")
         assert stop(server.process) == 0
 
@@ -287,18 +294,6 @@ def test_each_actor_has_its_topics_and_the_plain_ones_follow_one(
         viewer.wait_for(lambda: "/actors/a-1/step" not in viewer.channels)
         seen = viewer.count("/step")
         viewer.wait_for(lambda: viewer.count("/step") > seen)
-
-
-def test_a_slow_viewer_slows_nobody(hub: HubConfig, lives: list[Live]) -> None:
-    shown = ("/eye", "/tf", "/robot", "/boxes", "/step")
-    with serving(hub) as server, acting(hub, lives) as bus, server.viewer() as slow:
-        slow.subscribe(*shown)  # and reads nothing from now on
-        with server.viewer() as viewer:
-            viewer.subscribe(*shown)
-            viewer.wait_for(lambda: viewer.count("/step") >= 50)
-            assert viewer.count("/robot") >= 1
-        assert bus.watched(bus.keys.live("a-1"))
-        slow.wait_for(lambda: slow.count("/step") > 0)
 
 
 def test_a_port_in_use_is_bad_input(hub: HubConfig) -> None:
