@@ -112,6 +112,11 @@ class EpochMetrics:
     loss: Annotated[float, Number(0.0, 1e9)]
     learning_rate: Annotated[float, Number(0.0, LARGEST_LEARNING_RATE)]
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if nothing is trained in the stage."""
+        if self.stage not in (Stage.PRETRAINING, Stage.COUPLED):
+            raise ValueError(f"an epoch cannot be of the stage {self.stage}")
+
 
 Epochs = Annotated[
     tuple[EpochMetrics, ...], Many(record_of(EpochMetrics), Size("epochs", 0, MOST_EPOCHS))

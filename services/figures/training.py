@@ -95,9 +95,12 @@ class TrainingHistory:
         return history
 
     def _add_training(self, learner: LearnerSample | None) -> None:
-        for epoch in learner.epochs if learner else ():
-            curve = self.stages.setdefault(_STAGES[epoch.stage], StageCurve())
-            curve.add(epoch, learner.round if learner.stage is Stage.COUPLED else 0)
+        if learner is None:
+            return
+        # While the learner waits, its round is that of the next epochs.
+        number = 0 if learner.stage is Stage.WAITING else learner.round
+        for epoch in learner.epochs:
+            self.stages.setdefault(_STAGES[epoch.stage], StageCurve()).add(epoch, number)
 
     def rates_of(self, suite: str, reading: str) -> Mapping[int, Rate]:
         """Success by policy version, in one of READINGS."""

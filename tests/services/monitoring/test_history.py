@@ -151,7 +151,10 @@ def test_rates_of_actors_are_summed_and_restarts_are_noticed() -> None:
         lambda line: line.replace(b'"strict": 8', b'"strict": 11'),
         lambda line: line.replace(b'"format": 1', b'"format": 2'),
         lambda line: line.replace(b'"loss": 0.5', b'"loss": -1'),
-        lambda line: line.replace(b"coupled", b"asleep"),
+        lambda line: line.replace(b'"coupled"', b'"asleep"'),
+        lambda line: line.replace(
+            b'"epochs": [{"stage": "coupled"', b'"epochs": [{"stage": "waiting"'
+        ),
     ],
 )
 def test_a_line_is_checked(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
