@@ -42,7 +42,7 @@ from proto.messages import (
     TutoringRequest,
     Verdict,
 )
-from proto.metrics import LearnerMetrics, Stage
+from proto.metrics import EpochMetrics, LearnerMetrics, Stage
 from proto.recordings.episodes import read_episode, write_episode
 from proto.suites import Player
 
@@ -87,6 +87,7 @@ class LearnerSetup:
         self.actor.announce()
         self.policies: list[PolicyVersion] = []
         self.metrics: LearnerMetrics | None = None
+        self.epochs: list[EpochMetrics] = []
         self._receipts: list[Receipt] = []
         keys = self.actor.keys
         self.actor.subscribe_newest(keys.policy, self.policies.append, PolicyVersion)
@@ -197,6 +198,7 @@ class LearnerSetup:
 
     def _listen(self, metrics: LearnerMetrics) -> None:
         self.metrics = metrics
+        self.epochs += metrics.epochs
 
 
 @pytest.fixture
@@ -298,6 +300,12 @@ def test_pretraining_has_its_own_cases_and_does_not_wait_for_the_others(
     setup.send(setup.episode(second, id="reaching14"))
     formed = pretraining_file(setup.folder)
     eventually(formed.exists, "pre-training is over")
+
+    def told() -> bool:
+        epochs = [each for each in setup.epochs if each.stage is Stage.PRETRAINING]
+        return [each.epoch for each in epochs] == [1, 2, 3] and epochs[0].loss > 0
+
+    eventually(told, "the metrics have told each epoch once")
     metrics = setup.wait_for_metrics(
         lambda metrics: metrics.stage is Stage.WAITING and metrics.epoch == 3
     )
