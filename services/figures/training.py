@@ -199,6 +199,8 @@ def _draw_loss(axes: Axes, name: str, curve: StageCurve) -> None:
     if max(curve.loss.values()) > _DECADE * min(curve.loss.values()) > 0:
         _make_logarithmic(axes)
     _mark_rounds(axes, curve)
+    if curve.rounds:
+        axes.legend(loc="best")
     _label(axes, name, "epoch", "loss")
 
 
@@ -217,8 +219,6 @@ def _mark_rounds(axes: Axes, curve: StageCurve) -> None:
         line = axes.axvline(epoch, color=GREY, linewidth=0.6, linestyle=":")
         if number == min(curve.rounds):
             line.set_label("a round of corrections begins")
-    if curve.rounds:
-        axes.legend(loc="best")
 
 
 def _draw_success(axes: Axes, history: TrainingHistory) -> None:
