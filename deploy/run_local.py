@@ -29,8 +29,11 @@ from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore, SuiteScore
+from proto.permissions import Holder
 from proto.run_locks import owned_run
+from proto.security import certificate_for
 from services.arguments.common import config_argument, integer
+from services.arguments.process import PRIVATE
 from services.board import Board, RunView
 from services.machine.ports import port_trouble
 from services.terminal.display import display
@@ -50,6 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status.
     """
     arguments = _parser().parse_args(argv)
+    os.umask(PRIVATE)
     try:
         overrides = list(arguments.overrides)
         if arguments.backend is not None:
@@ -58,6 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         actors = actors_of(arguments.actors, config)
         check_actors(actors, config)
         check_can_be_done(config)
+        certificate_for(config.hub, Holder.HUB)
         if trouble := port_trouble(config.hub.endpoint):
             raise UserError(trouble)
         run(config, actors, RunConsole())

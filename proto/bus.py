@@ -30,7 +30,16 @@ from proto.config import HubConfig
 from proto.errors import UserError
 from proto.keys import Keys, Role
 from proto.lifecycle import Lifecycle
+from proto.permissions import HOLDER_OF, Holder
 from proto.plain_text import plain
+from proto.security import (
+    Certificate,
+    certificate_for,
+    hub_access_control,
+    link_settings,
+    reachable,
+    warn_if_insecure,
+)
 from proto.senders import Sender, is_id, origin_problem
 
 LOG = logging.getLogger(__name__)
@@ -45,6 +54,10 @@ _HEARTBEAT_S: Final = 1.0
 
 class NoHubError(UserError):
     """No hub answers, now."""
+
+
+class CannotListenError(UserError):
+    """The hub cannot listen at its endpoint, now."""
 
 
 M = TypeVar("M")
@@ -160,13 +173,22 @@ class Bus:
         role: role of this process.
         id: id of this process.
         refused: number of messages that were dropped because they were invalid.
+        certificate: what this process shows at the hub; None without security.
     """
 
-    def __init__(self, session: zenoh.Session, run: str, role: Role, process: str) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        run: str,
+        role: Role,
+        process: str,
+        certificate: Certificate | None = None,
+    ) -> None:
         self.keys = Keys(run)
         self.role = role
         self.id = process
         self.refused = 0
+        self.certificate = certificate
         self._session = session
         self._declared: list[Any] = []  # Zenoh undeclares what nobody refers to
         self._newest: dict[str, zenoh.ext.AdvancedPublisher] = {}
@@ -470,27 +492,40 @@ class Bus:
         return on_sample
 
 
-def open_bus(config: HubConfig, run: str, role: Role, process: str) -> Bus:
+def open_bus(
+    config: HubConfig, run: str, role: Role, process: str, *, holder: Holder | None = None
+) -> Bus:
     """Connect to the hub. A connection that is lost later is made again automatically.
 
+    Args:
+        config: the hub.
+        run: name of the run.
+        role: role of this process.
+        process: id of this process.
+        holder: whose certificate to show; None for that of the role.
+
     Raises:
-        NoHubError: no hub answers within CONNECT_WAIT_S.
+        NoHubError: no hub answers within CONNECT_WAIT_S, or it does not let this process in.
+        UserError: the endpoint is not protected, or the certificate cannot be used.
     """
-    settings = _settings(config, "client")
+    certificate = certificate_for(config, holder or HOLDER_OF[role])
+    warn_if_insecure(config)
+    settings = _settings(config, "client", certificate)
     settings["connect"] = {
-        "endpoints": [config.endpoint],
+        "endpoints": [reachable(config.endpoint)],
         "timeout_ms": round(CONNECT_WAIT_S * 1000),
         "exit_on_failure": True,
         "retry": {"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 2},
     }
     settings["listen"] = {"endpoints": []}
     try:
-        return Bus(_open(settings), run, role, process)
+        session = _open(settings)
     except zenoh.ZError as error:
         raise NoHubError(
             f"no hub answers at {config.endpoint}: start one with `vmdnn hub`, or name the right "
-            f"one with --connect tcp/HOST:PORT ({_reason(error)})"
+            f"one with --connect {config.endpoint.partition('/')[0]}/HOST:PORT ({_reason(error)})"
         ) from error
+    return Bus(session, run, role, process, certificate)
 
 
 def join_hub(
@@ -522,29 +557,36 @@ def open_hub(config: HubConfig, run: str, process: str) -> Bus:
     """Open the hub itself: a Zenoh router inside this process that listens at the endpoint.
 
     Raises:
-        UserError: it cannot listen there.
+        CannotListenError: it cannot listen there.
+        UserError: the endpoint is not protected, or the certificate cannot be used.
     """
-    settings = _settings(config, "router")
+    certificate = certificate_for(config, Holder.HUB)
+    warn_if_insecure(config)
+    settings = _settings(config, "router", certificate)
     settings["listen"] = {"endpoints": [config.endpoint], "exit_on_failure": True}
+    if certificate is not None:
+        settings["access_control"] = hub_access_control(config)
     try:
-        return Bus(_open(settings), run, Role.HUB, process)
+        return Bus(_open(settings), run, Role.HUB, process, certificate)
     except zenoh.ZError as error:
-        raise UserError(
+        raise CannotListenError(
             f"the hub cannot listen at {config.endpoint}: {_reason(error)}. Is another hub "
-            "running there? Stop it, or choose another port with --set hub.endpoint=tcp/HOST:PORT"
+            "running there? Stop it, or choose another port with --set hub.endpoint="
+            f"{config.endpoint.partition('/')[0]}/HOST:PORT"
         ) from error
 
 
-def _settings(config: HubConfig, mode: str) -> dict[str, Any]:
+def _settings(config: HubConfig, mode: str, certificate: Certificate | None) -> dict[str, Any]:
     return {
         "mode": mode,
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},  # the newest sample of a key is kept by its timestamp
         "transport": {
+            "link": link_settings(certificate, listens=mode == "router"),
             "shared_memory": {
                 "enabled": config.shared_memory,
                 "transport_optimization": {"message_size_threshold": SHARED_MEMORY_FROM_BYTES},
-            }
+            },
         },
     }
 

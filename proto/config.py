@@ -123,13 +123,34 @@ class RunConfig(_Section):
     seed: Annotated[int, Field(strict=True, ge=0, lt=2**32)] = 1
 
 
+ActorName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,39}$")]
+
+
 class HubConfig(_Section):
-    """The hub that all processes connect to."""
+    """The hub that all processes connect to, and how the links to it are protected.
+
+    `proto.security` checks that the values fit each other when a process connects or listens, so
+    that a saved configuration can be read on any machine.
+
+    Attributes:
+        endpoint: where the hub listens and all others connect.
+        shared_memory: large messages between processes of one machine go through shared memory.
+        security: `mutual-tls`: both ends of every link show a certificate, and the hub lets each
+            role do only what `proto.permissions` allows; needs an endpoint `tls/HOST:PORT`.
+            `none`: only processes of this machine can connect.
+        certificates: folder of the certificates; `~` is the home folder of each process.
+        actors: names of actors with certificates of their own, `actor-NAME`.
+        insecure: without security, allow an endpoint that other machines can reach.
+    """
 
     endpoint: Annotated[str, Field(pattern=r"^(tcp|tls|udp|quic|ws)/.+:\d+$")] = (
         "tcp/127.0.0.1:7447"
     )
     shared_memory: Switch = False
+    security: Literal["none", "mutual-tls"] = "none"
+    certificates: Path = Path("~/.config/vmdnn/certificates")
+    actors: tuple[ActorName, ...] = ()
+    insecure: Switch = False
 
 
 TaskName = Annotated[str, Field(min_length=1, max_length=200)]

@@ -42,11 +42,17 @@ def membership(bus: Bus, participant: Participant, lifecycle: Lifecycle) -> Iter
 
     def publish_metrics() -> None:
         lifecycle.log_wait()
-        metrics = replace(participant.metrics(), waiting_for=lifecycle.waiting_for[:500])
+        metrics = replace(
+            participant.metrics(),
+            waiting_for=lifecycle.waiting_for[:500],
+            certificate_days=_certificate_days(bus),
+        )
         bus.publish(bus.keys.metrics(bus.role, bus.id), metrics)
 
     bus.answer(bus.keys.control(bus.role), Control, on_control)
     bus.announce()
+    if bus.certificate is not None and bus.certificate.expires_soon:
+        LOG.warning(bus.certificate.expiry_words)
     with every(METRICS_PERIOD_S, publish_metrics):
         yield
     try:
@@ -83,6 +89,12 @@ def alone_in_run(bus: Bus, lifecycle: Lifecycle, *, patience_s: float = FROZEN_S
         lifecycle.waits_for(f"the end of {bus.role.with_article} that this run has already")
         lifecycle.wait(0.2)
     lifecycle.waits_for("")
+
+
+def _certificate_days(bus: Bus) -> int | None:
+    """Days until the certificate expires, if that is soon."""
+    certificate = bus.certificate
+    return certificate.days_left if certificate is not None and certificate.expires_soon else None
 
 
 def _obey(command: Command, participant: Participant, lifecycle: Lifecycle) -> str:

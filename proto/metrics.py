@@ -42,6 +42,8 @@ class Metrics:
         time_s: when the metrics were published (Unix time).
         refused: messages that the process dropped because they were invalid.
         waiting_for: what the process waits for, such as the hub; empty while it works.
+        certificate_days: days until its certificate expires, in the last 30; null before, and
+            without security.
     """
 
     role: Role
@@ -49,6 +51,7 @@ class Metrics:
     time_s: Annotated[float, Number(0.0, 1e11)]
     refused: Count
     waiting_for: Annotated[str, Text(500)] = ""
+    certificate_days: Annotated[int | None, Maybe(Integer(0, 30))] = None
 
 
 @message("metrics.actor", 4, form="json")

@@ -67,11 +67,19 @@ def single_process(run_folder: Path, role: Role, wanted: str | None) -> Iterator
 
 
 @contextmanager
-def own_id(run_folder: Path, role: Role, wanted: str | None) -> Iterator[str]:
+def own_id(
+    run_folder: Path, role: Role, wanted: str | None, *, host: str | None = None
+) -> Iterator[str]:
     """Reserve an id that no other process of this role in the run's folder has; gives the id.
 
     Without a wanted id it is the first free one of HOST-1, HOST-2, ...: a restarted process gets
     the id of its predecessor, and finds the files that the predecessor left.
+
+    Args:
+        run_folder: the run's folder.
+        role: role of this process.
+        wanted: id of this process; None for the first free one.
+        host: how the free ids begin; None for the name of this machine.
 
     Raises:
         UserError: another process has the wanted id.
@@ -80,7 +88,8 @@ def own_id(run_folder: Path, role: Role, wanted: str | None) -> Iterator[str]:
         with only_one(run_folder, role, wanted):
             yield wanted
         return
-    host = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40] or "host"
+    if host is None:
+        host = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40] or "host"
     for number in itertools.count(1):
         with _lock(run_folder, f"{role}-{host}-{number}") as held:
             if held:

@@ -29,11 +29,15 @@ class DiskFullError(StorageError):
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[BinaryIO]:
+def written_whole(path: Path, *, mode: int = 0o666) -> Iterator[BinaryIO]:
     """Write a file under a temporary name; it gets its own name once it is whole and on disk.
 
     Missing folders are made. If the writing fails, the file at `path` stays as it was and nothing
     else is left. A killed process leaves `NAME.<random>.part`, which `parts_in` finds.
+
+    Args:
+        path: the file.
+        mode: permissions with which it is made, less those of the umask.
 
     Raises:
         DiskFullError: no space is left.
@@ -42,7 +46,8 @@ def written_whole(path: Path) -> Iterator[BinaryIO]:
     make_folder(path.parent)
     part = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     with storage_errors(path):
-        with part.open("xb") as stream, _removed_if_it_fails(part):
+        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        with os.fdopen(descriptor, "wb") as stream, _removed_if_it_fails(part):
             yield stream
             stream.flush()
             os.fsync(stream.fileno())

@@ -8,6 +8,7 @@ older sources is never loaded.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import platform
 import shutil
@@ -16,7 +17,9 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from proto.cache import cache_folder
+from proto.cache import cache_folder, private_folder, writable_by_others
+
+LOG = logging.getLogger(__name__)
 
 FOLDER: Final = Path(__file__).parent
 SOURCES: Final = ("core.cpp", "adam.cpp", "mixing.cpp", "maps.cpp", "acting.cpp")
@@ -41,14 +44,31 @@ class NotCompiledError(Exception):
 def find_or_compile() -> Path:
     """The library for this machine: beside the sources, in the cache, or freshly compiled there.
 
+    A library that others could have put there is not used: it could do anything. Instead of such a
+    cache a folder of this user is used.
+
     Raises:
-        NotCompiledError: there is no compiler, or it failed.
+        NotCompiledError: there is no compiler, or it failed, or there is no safe folder.
     """
-    for folder in (FOLDER, cache_folder()):
+    beside = FOLDER / library_name()
+    if beside.is_file():  # who can write there can change the sources as well
+        return beside
+    unsafe = []
+    for folder in (cache_folder(), private_folder()):
         library = folder / library_name()
-        if library.is_file():
+        if reason := writable_by_others(library):
+            unsafe.append(reason)
+            if library.exists():
+                LOG.warning("%s is not used: %s", library, reason)
+        elif library.is_file():
             return library
-    return compile_into(cache_folder())
+    for folder in (cache_folder(), private_folder()):
+        if not writable_by_others(folder):
+            return compile_into(folder)
+    raise NotCompiledError(
+        f"there is no folder for it that is safe from others: {'; '.join(dict.fromkeys(unsafe))}."
+        " Name one in VMDNN_CACHE"
+    )
 
 
 def library_name() -> str:
@@ -66,7 +86,7 @@ def compile_into(folder: Path) -> Path:
     """
     compiler = _compiler()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             library = Path(scratch) / library_name()
             sources = [str(FOLDER / name) for name in SOURCES]

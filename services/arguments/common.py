@@ -43,8 +43,9 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument(
         "--connect",
-        metavar="tcp/HOST:PORT",
-        help="endpoint of the hub; without it, hub.endpoint of the configuration",
+        metavar="tcp/HOST:PORT|tls/HOST:PORT",
+        help="endpoint of the hub; without it, hub.endpoint of the configuration. tls/ also sets"
+        " hub.security=mutual-tls",
     )
 
 
@@ -97,6 +98,8 @@ def config_of(arguments: argparse.Namespace) -> Config:
     overrides = list(arguments.overrides)
     if getattr(arguments, "connect", None) is not None:
         overrides.append(f"hub.endpoint={arguments.connect}")
+        if arguments.connect.startswith("tls/"):
+            overrides.append("hub.security=mutual-tls")
     return load_config(arguments.config, overrides)
 
 

@@ -10,13 +10,14 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Final, Protocol
 
-from proto.bus import Bus, join_hub, open_hub
+from proto.bus import Bus, CannotListenError, join_hub, open_hub
 from proto.config import Config
 from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.periodic import every
 from proto.run_locks import own_id, single_process
+from proto.security import actor_name
 from proto.storage import DiskFullError, StorageError
 from services.arguments.common import config_of, start_logging
 
@@ -28,6 +29,8 @@ HEARTBEAT_S: Final = 1.0
 STUCK_S: Final = 600.0
 """The heartbeat ends when the main loop of a process has not gone on for this time."""
 TRY_AGAIN_S: Final = 5.0
+PRIVATE: Final = 0o077
+"""File mode creation mask: what the processes of a run write is for its user alone."""
 
 
 class Process(Protocol):
@@ -58,6 +61,7 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
     Raises:
         UserError: the configuration is not valid, or the run already has such a process.
     """
+    os.umask(PRIVATE)
     start_logging(role)
     config = config_of(arguments)
     lifecycle = Lifecycle()
@@ -72,7 +76,7 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
                 ):
                     if bus is not None:
                         make(config, bus, lifecycle).run()
-            except (StorageError, PortInUseError) as error:
+            except (StorageError, CannotListenError) as error:
                 if lifecycle.stopping or not (_supervised() or isinstance(error, DiskFullError)):
                     raise
                 if str(error) != told:
@@ -83,10 +87,6 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
             else:
                 return 0
     return 0
-
-
-class PortInUseError(UserError):
-    """The hub cannot listen, now."""
 
 
 def _supervised() -> bool:
@@ -111,7 +111,13 @@ def _identity(config: Config, role: Role, wanted: str | None) -> AbstractContext
     if role is Role.HUB:  # it does not use the run's folder
         return nullcontext(wanted or role.value)
     if role is Role.ACTOR:
-        return own_id(config.run_folder, role, wanted)
+        bound_to = actor_name(config.hub)
+        if bound_to and wanted and wanted != bound_to and not wanted.startswith(f"{bound_to}-"):
+            raise UserError(
+                f"--id {wanted}: the certificate of this machine's actors allows only {bound_to}"
+                f" and {bound_to}-NUMBER"
+            )
+        return own_id(config.run_folder, role, wanted, host=bound_to)
     return single_process(config.run_folder, role, wanted)
 
 
@@ -119,10 +125,7 @@ def _identity(config: Config, role: Role, wanted: str | None) -> AbstractContext
 def _join(config: Config, role: Role, name: str, lifecycle: Lifecycle) -> Iterator[Bus | None]:
     """Connect, or be the hub; None if the process was asked to stop before there was a hub."""
     if role is Role.HUB:
-        try:
-            bus: Bus | None = open_hub(config.hub, config.run.name, name)
-        except UserError as error:
-            raise PortInUseError(str(error)) from error
+        bus: Bus | None = open_hub(config.hub, config.run.name, name)
     else:
         bus = join_hub(config.hub, config.run.name, role, name, lifecycle)
     if bus is None:

@@ -13,6 +13,7 @@ from proto.bus import open_bus
 from proto.codec import encode
 from proto.keys import Role
 from proto.messages import Command, Control, ControlReply
+from proto.permissions import Holder
 from proto.plain_text import plain
 from services.arguments.common import add_connection, config_of
 
@@ -36,7 +37,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Send the command and print the replies; without replies the exit status is 1."""
     config = config_of(arguments)
     role, control = Role(arguments.role), Control(Command(arguments.do))
-    with open_bus(config.hub, config.run.name, Role.WATCH, f"control-{os.getpid()}") as bus:
+    hub, name = config.hub, f"control-{os.getpid()}"
+    with open_bus(hub, config.run.name, Role.WATCH, name, holder=Holder.OPERATOR) as bus:
         replies = bus.ask(bus.keys.control(role), control, ControlReply, timeout_s=REPLY_WITHIN_S)
     if not replies:
         print(

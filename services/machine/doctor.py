@@ -15,8 +15,15 @@ from packaging.requirements import Requirement
 
 from actors.simulator import load_backend
 from learner.kernels.build import NotCompiledError, find_or_compile
-from proto.config import Config, SimulatorConfig
+from proto.config import Config, HubConfig, SimulatorConfig
 from proto.errors import UserError
+from proto.security import (
+    certificate_files,
+    certificate_folder,
+    certificate_of,
+    check_link,
+    is_loopback,
+)
 from services.machine.ports import port_trouble
 
 LOCK: Final = Path(__file__).parents[2] / "deploy" / "requirements.lock"
@@ -63,6 +70,7 @@ def examine(config: Config) -> Iterator[Finding]:
     yield check_memory(_available_memory_gb())
     yield check_disk(config.run.folder)
     yield check_port(config.hub.endpoint)
+    yield check_security(config.hub)
     yield check_kernel()
     yield check_graphics(config.simulator)
 
@@ -151,6 +159,28 @@ def check_port(endpoint: str) -> Finding:
     if trouble := port_trouble(endpoint):
         return Finding("hub port", endpoint, trouble)
     return Finding("hub port", f"{endpoint} is free")
+
+
+def check_security(config: HubConfig) -> Finding:
+    """Check who can connect to the hub, and the certificates that this machine has."""
+    try:
+        check_link(config)
+        if config.security == "none":
+            who = "only processes of this machine can connect to the hub"
+            if not is_loopback(config.endpoint):
+                who = "hub.insecure: everyone who can reach the hub may stop and change the run"
+            return Finding("security", who)
+        folder = certificate_folder(config)
+        held = [certificate_of(folder, file.stem) for file in certificate_files(folder)]
+    except UserError as error:
+        return Finding("security", "the hub cannot be used like this", str(error))
+    if not held:
+        return Finding(
+            "security", f"there is no certificate in {folder}", "make some: deploy/certificates.sh"
+        )
+    first = min(held, key=lambda certificate: certificate.expires)
+    found = f"{len(held)} certificates in {folder}, valid until {first.expires:%Y-%m-%d}"
+    return Finding("security", found, first.expiry_words if first.expires_soon else "")
 
 
 def check_kernel() -> Finding:
