@@ -53,7 +53,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status.
     """
     arguments = _parser().parse_args(argv)
-    os.umask(PRIVATE)
     try:
         overrides = list(arguments.overrides)
         if arguments.backend is not None:
@@ -340,4 +339,5 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
+    os.umask(PRIVATE)
     sys.exit(main())

@@ -1,7 +1,8 @@
-"""Who may send what: the one table of it, applied to every message that comes over the bus.
+"""Which role may send which message, checked with every message that comes over the bus.
 
-The hub knows no passwords: whoever can connect to it can write any name into a message. This keeps
-out mistakes, and processes of another run or version; it does not keep out a forger.
+Whoever can connect to the hub can write any name into a message. This keeps out mistakes, and
+processes of another run or version. It does not keep out a forger: that is what certificates and
+`proto.permissions` are for.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def vmdnn(*words: str | Path, log: Path | None = None) -> Iterator[subprocess.Po
 @contextmanager
 def listening_hub(endpoint: str, *words: str | Path) -> Iterator[subprocess.Popen[bytes]]:
     """Run `vmdnn hub` in another process, and wait until it accepts connections."""
-    host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
 
     def listens() -> bool:
         with socket.socket() as probe:
