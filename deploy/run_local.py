@@ -27,6 +27,7 @@ from proto.config import Config, load_config
 from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
+from proto.machine import usable_cores
 from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore, SuiteScore
 from proto.permissions import Holder
@@ -87,7 +88,7 @@ class RunConsole(Console):
 
 def default_actors() -> int:
     """Return one actor for each core; they use the processor time that the learner leaves."""
-    return len(os.sched_getaffinity(0))
+    return usable_cores()
 
 
 def actors_of(given: Mapping[str, int] | int | None, config: Config) -> Mapping[str, int]:
@@ -100,7 +101,7 @@ def actors_of(given: Mapping[str, int] | int | None, config: Config) -> Mapping[
     """
     if isinstance(given, Mapping):
         return given
-    number = len(os.sched_getaffinity(0)) if given is None else given
+    number = usable_cores() if given is None else given
     return {config.simulator.backend: number}
 
 

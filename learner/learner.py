@@ -42,6 +42,7 @@ from proto.config import Config
 from proto.disk_waits import when_disk_allows
 from proto.episode import Episode, Kind
 from proto.errors import UserError
+from proto.joining import answer_configuration
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import alone_in_run, membership
@@ -160,6 +161,7 @@ class Learner:
         alone_in_run(self._bus, self._lifecycle)
         self._agreement.check()
         self._agreement.answer()
+        answer_configuration(self._bus, self._config)
         self._write(lambda: self._config.save(self._folder / "config.yaml"))
         self._publish()
         keys = self._bus.keys

@@ -714,6 +714,10 @@ class Config(_Section):
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
+    def as_yaml(self) -> str:
+        """Return all values as YAML."""
+        return dump_yaml(self.model_dump(mode="json"))
+
     def save(self, path: Path) -> None:
         """Write the effective configuration as YAML.
 
@@ -721,7 +725,7 @@ class Config(_Section):
             UserError: the file cannot be written.
         """
         with written_whole(path) as stream:
-            stream.write(dump_yaml(self.model_dump(mode="json")).encode())
+            stream.write(self.as_yaml().encode())
 
 
 def _overlap(one: range, other: range) -> bool:
@@ -737,6 +741,30 @@ def _overlap_words(seeds: str, key: str, suite: Suite, other: Suite) -> str:
     return f"evaluator.suites: the {seeds} of two suites overlap: {listed}; give one another {key}"
 
 
+def read_config(text: str, overrides: Sequence[str], where: str) -> Config:
+    """Read the configuration of a run as another process sent it, and apply overrides.
+
+    Its sections `hub` and `run.folder` are left out: they are about the machine of the other.
+
+    Args:
+        text: the configuration as YAML.
+        overrides: `key.path=value` overrides.
+        where: where the text comes from, for messages.
+
+    Raises:
+        UserError: it is not valid; this version of vmdnn may have other keys.
+    """
+    try:
+        values = load_yaml(text)
+    except yaml.YAMLError as error:
+        raise UserError(f"{where} cannot be read: {error}") from error
+    if not isinstance(values, dict) or not isinstance(values.get("run"), dict):
+        raise UserError(f"{where} has no section `run`")
+    values.pop("hub", None)
+    values["run"].pop("folder", None)
+    return _checked(values, overrides, where)
+
+
 def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     """Read a YAML file (None: all defaults) and apply `key.path=value` overrides.
 
@@ -744,12 +772,15 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
         UserError: missing file, broken YAML, unknown key, wrong type or value out of range.
     """
     values = {} if path is None else _read(path)
+    return _checked(values, overrides, f"config file {path}" if path else "config")
+
+
+def _checked(values: dict[str, Any], overrides: Sequence[str], where: str) -> Config:
     for override in overrides:
         _apply(values, override)
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        where = f"config file {path}" if path else "config"
         problems = "\n".join(
             f"  {_key_of(problem)}: {_what_is_wrong(problem)}" for problem in error.errors()
         )

@@ -57,6 +57,15 @@ class Keys:
         return f"vmdnn/{self.run}/settings"
 
     @property
+    def configuration(self) -> str:
+        """A process that joins asks the learner for the `RunConfiguration`."""
+        return f"vmdnn/{self.run}/configuration"
+
+    def identity(self, actor: str = ANYONE) -> str:
+        """An actor that joins asks who else has its id: `Identity`, answered by `Identity`."""
+        return f"vmdnn/{self.run}/identity/{actor}"
+
+    @property
     def verdict(self) -> str:
         """Evaluator to learner: `Verdict`."""
         return f"vmdnn/{self.run}/verdict"

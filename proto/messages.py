@@ -298,6 +298,46 @@ class Settings:
     values: Annotated[tuple[Setting, ...], Many(record_of(Setting), Size("values", 0, 1000))]
 
 
+@message("configuration_request", 1, form="json")
+@dataclass(frozen=True)
+class ConfigurationRequest:
+    """A joining process's request for the configuration of the run.
+
+    Attributes:
+        role: role of the process.
+    """
+
+    role: Role
+
+
+@message("configuration", 1, form="json", limit=MEBIBYTE)
+@dataclass(frozen=True)
+class RunConfiguration:
+    """The effective configuration of the run, from the learner to a process that joins.
+
+    Attributes:
+        text: the configuration as YAML.
+        digest: digest of the configuration, see `proto.config.Config.digest`.
+    """
+
+    text: Annotated[str, Text(MEBIBYTE // 2)]
+    digest: Annotated[str, Text(64)]
+
+
+@message("identity", 1, form="json")
+@dataclass(frozen=True)
+class Identity:
+    """Which process uses the id of an actor; question and answer are the same message.
+
+    Attributes:
+        process: random name of the process.
+        joined: whether it takes part under this id; otherwise it is about to.
+    """
+
+    process: Annotated[str, Text(32, "[0-9a-f]{32}")]
+    joined: bool
+
+
 LIVE_SCENE_EVERY: Final = 10
 """The first of so many control steps carries the scene, for viewers that begin to look."""
 

@@ -124,6 +124,8 @@ def _rows() -> Iterator[Row]:
         ((learner, evaluator, recorder, actor), (query,)),
         ((learner, evaluator), (reply,)),
     )
+    yield _row(keys.configuration, ((evaluator, recorder, actor), (query,)), (learner, (reply,)))
+    yield _row(keys.identity(ACTOR_ID), (actor, (query, reply)))
     yield _row(keys.live(ACTOR_ID), (actor, (put,)), (_LOOKERS, (subscribe,)))
     for role in _MEMBERS:
         name = ACTOR_ID if role is Role.ACTOR else _ID
@@ -142,7 +144,7 @@ def _rows() -> Iterator[Row]:
 TABLE: Final = tuple(_rows())
 """All keys. The hub itself is the router: what it does is listed, but it is not held to it."""
 
-_OWN: Final = frozenset({Verb.PUT, Verb.SUBSCRIBE, Verb.TOKEN})
+_OWN: Final = frozenset({Verb.PUT, Verb.SUBSCRIBE, Verb.REPLY, Verb.TOKEN})
 """What an actor with a certificate of its own may do under its own id only."""
 
 _INGRESS: Final[Mapping[Verb, tuple[str, ...]]] = {

@@ -7,7 +7,7 @@ import itertools
 import logging
 import re
 import socket
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -68,7 +68,12 @@ def single_process(run_folder: Path, role: Role, wanted: str | None) -> Iterator
 
 @contextmanager
 def own_id(
-    run_folder: Path, role: Role, wanted: str | None, *, host: str | None = None
+    run_folder: Path,
+    role: Role,
+    wanted: str | None,
+    *,
+    host: str | None = None,
+    taken: Collection[str] = (),
 ) -> Iterator[str]:
     """Reserve an id that no other process of this role in the run's folder has; gives the id.
 
@@ -80,6 +85,7 @@ def own_id(
         role: role of this process.
         wanted: id of this process; None for the first free one.
         host: how the free ids begin; None for the name of this machine.
+        taken: ids that are not free, because processes on other machines have them.
 
     Raises:
         UserError: another process has the wanted id.
@@ -91,6 +97,8 @@ def own_id(
     if host is None:
         host = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname()).strip("-")[:40] or "host"
     for number in itertools.count(1):
+        if f"{host}-{number}" in taken:
+            continue
         with _lock(run_folder, f"{role}-{host}-{number}") as held:
             if held:
                 yield f"{host}-{number}"

@@ -65,6 +65,16 @@ def listening_address(text: str) -> tuple[str, int]:
     return host.strip("[]") or "127.0.0.1", int(port)
 
 
+def add_joining(parser: argparse.ArgumentParser) -> None:
+    """Add --run, for a process that can take the run's configuration from the bus."""
+    parser.add_argument(
+        "--run",
+        dest="run_name",
+        metavar="NAME",
+        help="name of the run, whose configuration comes from its learner; instead of --config",
+    )
+
+
 def config_file(name: str) -> Path:
     """Return the file of a configuration.
 
@@ -94,13 +104,26 @@ def config_argument(name: str) -> Path:
 
 
 def config_of(arguments: argparse.Namespace) -> Config:
-    """Load the configuration that --config, --set and, if present, --connect select."""
+    """Load the configuration that --config, --set and, if present, --connect and --run select."""
+    return load_config(arguments.config, overrides_of(arguments))
+
+
+def overrides_of(arguments: argparse.Namespace) -> list[str]:
+    """Return the overrides that --set and, if present, --connect and --run select.
+
+    Raises:
+        UserError: there is both --config and --run.
+    """
     overrides = list(arguments.overrides)
     if getattr(arguments, "connect", None) is not None:
         overrides.append(f"hub.endpoint={arguments.connect}")
         if arguments.connect.startswith("tls/"):
             overrides.append("hub.security=mutual-tls")
-    return load_config(arguments.config, overrides)
+    if getattr(arguments, "run_name", None) is not None:
+        if arguments.config is not None:
+            raise UserError("--run takes the run's configuration from its learner: no --config")
+        overrides.append(f"run.name={arguments.run_name}")
+    return overrides
 
 
 def start_logging(role: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Final, Protocol
@@ -13,13 +13,14 @@ from typing import Final, Protocol
 from proto.bus import Bus, CannotListenError, join_hub, open_hub
 from proto.config import Config
 from proto.errors import UserError
+from proto.joining import Claim, ask_configuration
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.periodic import every
 from proto.run_locks import own_id, single_process
 from proto.security import actor_name
 from proto.storage import DiskFullError, StorageError
-from services.arguments.common import config_of, start_logging
+from services.arguments.common import config_of, overrides_of, start_logging
 
 LOG = logging.getLogger(__name__)
 
@@ -67,15 +68,29 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
     told = ""
+    taken: set[str] = set()
     with _heartbeat(lifecycle):
         while not lifecycle.stopping:
             try:
                 with (
-                    _identity(config, role, arguments.id) as name,
+                    _identity(config, role, arguments.id, taken) as name,
                     _join(config, role, name, lifecycle) as bus,
                 ):
-                    if bus is not None:
-                        make(config, bus, lifecycle).run()
+                    if bus is None:
+                        return 0
+                    if role is Role.ACTOR and not Claim(bus).holds(lifecycle):
+                        if arguments.id is not None:
+                            raise UserError(
+                                f"the run {config.run.name} has an actor with the id {name}"
+                                " already, on another machine or in another folder: choose"
+                                " another --id"
+                            )
+                        LOG.warning("another actor of the run has the id %s; takes another", name)
+                        taken.add(name)
+                        continue
+                    effective = _effective(config, arguments, bus, lifecycle)
+                    if effective is not None:
+                        make(effective, bus, lifecycle).run()
             except (StorageError, CannotListenError) as error:
                 if lifecycle.stopping or not (_supervised() or isinstance(error, DiskFullError)):
                     raise
@@ -106,7 +121,18 @@ def _heartbeat(lifecycle: Lifecycle) -> AbstractContextManager[None]:
     return every(HEARTBEAT_S, beat)
 
 
-def _identity(config: Config, role: Role, wanted: str | None) -> AbstractContextManager[str]:
+def _effective(
+    config: Config, arguments: argparse.Namespace, bus: Bus, lifecycle: Lifecycle
+) -> Config | None:
+    """The configuration, which comes from the run's learner with --run; None if asked to stop."""
+    if getattr(arguments, "run_name", None) is None:
+        return config
+    return ask_configuration(bus, overrides_of(arguments), lifecycle)
+
+
+def _identity(
+    config: Config, role: Role, wanted: str | None, taken: Collection[str]
+) -> AbstractContextManager[str]:
     """Reserve the id of a process. A run has many actors, but one process of every other role."""
     if role is Role.HUB:  # it does not use the run's folder
         return nullcontext(wanted or role.value)
@@ -117,7 +143,7 @@ def _identity(config: Config, role: Role, wanted: str | None) -> AbstractContext
                 f"--id {wanted}: the certificate of this machine's actors allows only {bound_to}"
                 f" and {bound_to}-NUMBER"
             )
-        return own_id(config.run_folder, role, wanted, host=bound_to)
+        return own_id(config.run_folder, role, wanted, host=bound_to, taken=taken)
     return single_process(config.run_folder, role, wanted)
 
 

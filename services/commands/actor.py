@@ -9,7 +9,7 @@ from typing import Final
 
 from actors.actor import Actor
 from proto.keys import Role
-from services.arguments.common import add_process
+from services.arguments.common import add_joining, add_process
 from services.arguments.process import run_process
 
 NICENESS: Final = 10
@@ -19,6 +19,7 @@ NICENESS: Final = 10
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_process(parser)
+    add_joining(parser)
     parser.add_argument(
         "--backend",
         help="this actor's simulator; without it, simulator.backend of the configuration",

@@ -9,7 +9,7 @@ from proto.bus import Bus
 from proto.config import Config
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
-from services.arguments.common import add_process
+from services.arguments.common import add_joining, add_process
 from services.arguments.process import run_process
 from services.evaluator import Evaluator
 
@@ -17,6 +17,7 @@ from services.evaluator import Evaluator
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_process(parser)
+    add_joining(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

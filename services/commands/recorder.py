@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from proto.keys import Role
-from services.arguments.common import add_process
+from services.arguments.common import add_joining, add_process
 from services.arguments.process import run_process
 from services.recorder import Recorder
 
@@ -13,6 +13,7 @@ from services.recorder import Recorder
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_process(parser)
+    add_joining(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:

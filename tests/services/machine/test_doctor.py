@@ -32,7 +32,8 @@ def test_this_machine_has_no_problem(capsys: pytest.CaptureFixture[str]) -> None
     status = main(["doctor", "--json", "--set", f"hub.endpoint={free_endpoint()}"])
     findings = {finding["check"]: finding for finding in json.loads(capsys.readouterr().out)}
     assert set(findings) == {
-        "python", "packages", "cores", "memory", "disk", "hub port", "security", "kernel", "graphics",
+        "python", "packages", "cores", "memory", "disk", "hub port", "security", "kernel",
+        "graphics",
     }  # fmt: skip
     assert findings["graphics"]["ok"], findings["graphics"]
     assert status == (0 if all(finding["ok"] for finding in findings.values()) else 1)
