@@ -714,9 +714,9 @@ class Config(_Section):
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
-    def as_yaml(self) -> str:
-        """Return all values as YAML."""
-        return dump_yaml(self.model_dump(mode="json"))
+    def as_json(self) -> str:
+        """Return all values as JSON in one line."""
+        return json.dumps(self.model_dump(mode="json"))
 
     def save(self, path: Path) -> None:
         """Write the effective configuration as YAML.
@@ -725,7 +725,7 @@ class Config(_Section):
             UserError: the file cannot be written.
         """
         with written_whole(path) as stream:
-            stream.write(self.as_yaml().encode())
+            stream.write(dump_yaml(self.model_dump(mode="json")).encode())
 
 
 def _overlap(one: range, other: range) -> bool:
@@ -747,7 +747,7 @@ def read_config(text: str, overrides: Sequence[str], where: str) -> Config:
     Its sections `hub` and `run.folder` are left out: they are about the machine of the other.
 
     Args:
-        text: the configuration as YAML.
+        text: the configuration as JSON.
         overrides: `key.path=value` overrides.
         where: where the text comes from, for messages.
 
@@ -755,8 +755,8 @@ def read_config(text: str, overrides: Sequence[str], where: str) -> Config:
         UserError: it is not valid; this version of vmdnn may have other keys.
     """
     try:
-        values = load_yaml(text)
-    except yaml.YAMLError as error:
+        values = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise UserError(f"{where} cannot be read: {error}") from error
     if not isinstance(values, dict) or not isinstance(values.get("run"), dict):
         raise UserError(f"{where} has no section `run`")

@@ -19,7 +19,7 @@ SETTLE_S: Final = 1.0
 
 def answer_configuration(bus: Bus, config: Config) -> None:
     """Answer each process that joins with the configuration of the run, as its learner."""
-    ours = RunConfiguration(config.as_yaml(), config.digest())
+    ours = RunConfiguration(config.as_json(), config.digest())
     bus.answer(bus.keys.configuration, ConfigurationRequest, lambda _: ours)
 
 

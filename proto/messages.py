@@ -316,7 +316,7 @@ class RunConfiguration:
     """The effective configuration of the run, from the learner to a process that joins.
 
     Attributes:
-        text: the configuration as YAML.
+        text: the configuration as JSON.
         digest: digest of the configuration, see `proto.config.Config.digest`.
     """
 

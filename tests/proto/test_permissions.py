@@ -31,6 +31,8 @@ def test_every_key_has_a_row() -> None:
         keys.request_tutoring,
         keys.request_trial,
         keys.settings,
+        keys.configuration,
+        keys.identity("<actor>"),
         keys.live("<actor>"),
         *(keys.metrics(role, name) for role, name in ids.items()),
         *(keys.alive(role, name) for role, name in ids.items()),

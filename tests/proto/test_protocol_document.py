@@ -35,6 +35,9 @@ MESSAGES = (
     messages.Control,
     messages.ControlReply,
     messages.Settings,
+    messages.ConfigurationRequest,
+    messages.RunConfiguration,
+    messages.Identity,
     *METRICS,
 )
 
@@ -92,6 +95,8 @@ def test_every_key_is_documented() -> None:
         keys.receipt("<role>", "<actor>"),
         keys.verdict,
         keys.settings,
+        keys.configuration,
+        keys.identity("<actor>"),
         keys.request_tutoring,
         keys.request_trial,
         keys.live("<actor>"),
