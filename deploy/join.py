@@ -24,6 +24,7 @@ from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.machine import usable_cores
 from proto.permissions import Holder
+from proto.plain_text import plain_lines
 from proto.run_locks import owned_run
 from proto.security import certificate_for
 from services.arguments.common import integer
@@ -49,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         number = usable_cores() if arguments.actors is None else arguments.actors
         join(config, _command(arguments, overrides), number)
     except (UserError, ProcessFailedError) as error:
-        print(f"join: {error}", file=sys.stderr)
+        print(f"join: {plain_lines(error)}", file=sys.stderr)
         return BAD_INPUT
     except SupervisorEndedError as error:
         print(f"join: {error}; the same command joins the run again", file=sys.stderr)

@@ -31,6 +31,7 @@ from proto.machine import usable_cores
 from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore, SuiteScore
 from proto.permissions import Holder
+from proto.plain_text import plain_lines
 from proto.run_locks import owned_run
 from proto.security import certificate_for
 from services.arguments.common import config_argument, integer
@@ -67,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise UserError(trouble)
         run(config, actors, RunConsole())
     except (UserError, ProcessFailedError) as error:
-        print(f"run_local: {error}", file=sys.stderr)
+        print(f"run_local: {plain_lines(error)}", file=sys.stderr)
         return BAD_INPUT
     except SupervisorEndedError as error:
         print(f"run_local: {error}; the same command continues the run", file=sys.stderr)

@@ -10,6 +10,7 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -42,7 +43,6 @@ class Run:
         config = load_config(config_file(RUN))
         assert config.done.policy_versions is not None
         self.versions, self.trials = config.done.policy_versions, config.done.trials
-        self.sequences = 6  # three cases of pre-training, three of the task
 
     def certificates(self, host: Host, *names: str) -> Path:
         """Give a host its certificates."""
@@ -91,9 +91,9 @@ class Run:
         newest = [trial for trial in self.counted() if trial["policy_version"] == self.versions]
         return len(newest) >= (self.trials or 0)
 
-    def waiting(self, host: Host) -> int:
+    def waiting(self, host: Host) -> list[Path]:
         """Episodes in the outboxes of a host."""
-        return len(list((host.folder / "runs" / RUN / "outbox").glob("*/*/*.message")))
+        return list((host.folder / "runs" / RUN / "outbox").glob("*/*/*.message"))
 
 
 @pytest.fixture
@@ -124,14 +124,17 @@ def test_a_run_on_four_hosts_survives_a_bad_link(played: Run, trouble: tuple[str
     actors = (played.bad, played.good)
     for host in actors:
         assert host.stop() == [0]
-    left = [played.waiting(host) for host in actors]
+    left = [message for host in actors for message in played.waiting(host)]
     # What they had not sent when they were stopped is sent by the next process.
     for host, certificate, at in zip(
         actors, ("actor", "actor-vm4"), (address, played.center.address), strict=True
     ):
         played.join(host, at, certificate)
+    for host in actors:
+        again = partial(host.has_said_twice, "1 actor for the run", "join.log")
+        eventually(again, "it joins again", PATIENCE_S)
     eventually(
-        lambda: sum(played.waiting(host) for host in actors) == 0 or not any(left),
+        lambda: not any(message.exists() for message in left),
         "everything has its receipts",
         PATIENCE_S,
     )
