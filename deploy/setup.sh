@@ -1,5 +1,5 @@
 # shellcheck shell=bash
-# Sourced by run_local.sh and test.sh. `setup` installs what this checkout needs to run: Python, a
+# Sourced by run_local.sh, join.sh, certificates.sh and test.sh. `setup` installs what this checkout needs to run: Python, a
 # compiler, the locked packages in .venv, and what the simulator needs: its own packages and a graphics
 # driver. Its arguments are those of run_local.sh, which select the simulator. It installs only what is
 # missing; a second call takes about a second.

@@ -161,6 +161,6 @@ def test_a_run_on_four_hosts_survives_a_bad_link(played: Run, trouble: tuple[str
     log = "".join(
         file.read_text() for file in (played.bad.folder / "runs" / RUN / "logs").glob("actor*.log*")
     )
-    assert ("lost the hub" in log) is ("cut" in trouble)
+    assert "lost the hub" in log or "cut" not in trouble
     ids = {path.name for path in (played.good.folder / "runs" / RUN / "outbox").iterdir()}
     assert ids == {"vm4-1"}
