@@ -129,14 +129,13 @@ def _rows() -> Iterator[Row]:
     yield _row(keys.live(ACTOR_ID), (actor, (put,)), (_LOOKERS, (subscribe,)))
     for role in _MEMBERS:
         name = ACTOR_ID if role is Role.ACTOR else _ID
-        yield _row(
-            keys.metrics(role, name),
-            (HOLDER_OF[role], (put, subscribe)),
-            (_LOOKERS, (subscribe,)),
-        )
+        yield _row(keys.metrics(role, name), (HOLDER_OF[role], (put, subscribe)))
+    # A subscription must be within the key of one row, so the wildcard has a row of its own.
+    yield _row(keys.metrics(), (_LOOKERS, (subscribe,)))
     for role in _MEMBERS:
         name = ACTOR_ID if role is Role.ACTOR else _ID
-        yield _row(keys.alive(role, name), (HOLDER_OF[role], (token,)), (Holder, (presence,)))
+        yield _row(keys.alive(role, name), (HOLDER_OF[role], (token,)))
+    yield _row(keys.alive(), (Holder, (presence,)))
     for role in _MEMBERS:
         yield _row(keys.control(role), (HOLDER_OF[role], (reply,)), (Holder.OPERATOR, (query,)))
 

@@ -35,7 +35,9 @@ def test_every_key_has_a_row() -> None:
         keys.identity("<actor>"),
         keys.live("<actor>"),
         *(keys.metrics(role, name) for role, name in ids.items()),
+        keys.metrics(),
         *(keys.alive(role, name) for role, name in ids.items()),
+        keys.alive(),
         *(keys.control(role) for role in members),
     }
 
