@@ -103,13 +103,14 @@ def _rows() -> Iterator[Row]:
     token, presence = Verb.TOKEN, Verb.PRESENCE
     learner, evaluator, actor = Holder.LEARNER, Holder.EVALUATOR, Holder.ACTOR
     recorder = Holder.RECORDER
+    readers = (actor, evaluator, recorder)
     # Late joiners ask the publisher for the newest policy. They ask below `@adv`, which `*` and
     # `**` do not match; the answer has the key of the policy.
-    yield _row(keys.policy, (learner, (put, reply)), ((actor, evaluator), (subscribe, query)))
+    yield _row(keys.policy, (learner, (put, reply)), (readers, (subscribe, query)))
     yield _row(
         f"{keys.policy}/@adv/**",
         (learner, (put, reply, token)),
-        ((actor, evaluator), (subscribe, query, presence)),
+        (readers, (subscribe, query, presence)),
     )
     yield _row(keys.sequence(ACTOR_ID), (actor, (put,)), (learner, (subscribe,)))
     yield _row(keys.rollout(ACTOR_ID), (actor, (put,)), ((evaluator, recorder), (subscribe,)))
@@ -131,7 +132,7 @@ def _rows() -> Iterator[Row]:
         name = ACTOR_ID if role is Role.ACTOR else _ID
         yield _row(keys.metrics(role, name), (HOLDER_OF[role], (put, subscribe)))
     # A subscription must be within the key of one row, so the wildcard has a row of its own.
-    yield _row(keys.metrics(), (_LOOKERS, (subscribe,)))
+    yield _row(keys.metrics(), ((*_LOOKERS, recorder), (subscribe,)))
     for role in _MEMBERS:
         name = ACTOR_ID if role is Role.ACTOR else _ID
         yield _row(keys.alive(role, name), (HOLDER_OF[role], (token,)))
