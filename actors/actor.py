@@ -6,6 +6,7 @@ import logging
 import secrets
 import threading
 import time
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -454,18 +455,19 @@ class Actor:
                 self._bus.publish(live_key, message, check=False)
 
         try:
-            episode = play(
-                self._simulator,
-                assignment.task,
-                assignment.policy,
-                assignment.situation,
-                seed=assignment.seed,
-                kind=assignment.kind,
-                actor=self._bus.id,
-                config_digest=self._agreement.digest,
-                on_step=on_step,
-                conditions=assignment.conditions,
-            )
+            with self._reported_if_killed(assignment):
+                episode = play(
+                    self._simulator,
+                    assignment.task,
+                    assignment.policy,
+                    assignment.situation,
+                    seed=assignment.seed,
+                    kind=assignment.kind,
+                    actor=self._bus.id,
+                    config_digest=self._agreement.digest,
+                    on_step=on_step,
+                    conditions=assignment.conditions,
+                )
         except (_StoppedError, UserError, OSError, MemoryError):
             raise  # nothing is wrong with the episode
         except Exception as error:
@@ -511,7 +513,22 @@ class Actor:
         LOG.warning("the simulation of an episode (%s) failed: %s", failed.kind, problem)
         if failed.kind is Kind.PRACTICE:
             return
-        report = EpisodeFailed(
+        report = self._report_of(failed, problem)
+        outbox, receiver = self._outbox_of(failed.kind)
+        key, wire = self._bus.keys.failure(self._bus.id), encode(report)
+        when_disk_allows(self._lifecycle, lambda: outbox.add(report.id, key, wire, [receiver]))
+
+    def _reported_if_killed(self, played: Assignment) -> AbstractContextManager[None]:
+        """Have the next process report an episode that kills this one, such as by a crash."""
+        if played.kind is Kind.PRACTICE:
+            return nullcontext()
+        report = self._report_of(played, "the actor's process died while it played it", died=True)
+        outbox, receiver = self._outbox_of(played.kind)
+        key = self._bus.keys.failure(self._bus.id)
+        return outbox.sent_if_killed(report.id, key, encode(report), [receiver])
+
+    def _report_of(self, failed: Assignment, problem: str, *, died: bool = False) -> EpisodeFailed:
+        return EpisodeFailed(
             id=secrets.token_hex(16),
             actor=self._bus.id,
             kind=failed.kind,
@@ -521,13 +538,15 @@ class Actor:
             training=failed.training,
             policy_version=failed.policy.version,
             problem=plain(problem)[:1000],
+            died=died,
             conditions=failed.conditions,
         )
-        outbox, receiver = self._sequences, Role.LEARNER
-        if failed.kind is Kind.TRIAL:
-            outbox, receiver = self._rollouts, Role.EVALUATOR
-        key, wire = self._bus.keys.failure(self._bus.id), encode(report)
-        when_disk_allows(self._lifecycle, lambda: outbox.add(report.id, key, wire, [receiver]))
+
+    def _outbox_of(self, kind: Kind) -> tuple[Outbox, Role]:
+        """The outbox of reports about episodes of a kind, and who receives them."""
+        if kind is Kind.TRIAL:
+            return self._rollouts, Role.EVALUATOR
+        return self._sequences, Role.LEARNER
 
     def _on_policy(self, message: PolicyVersion) -> None:
         """Keep the newest policy of this run until the next episode begins."""
