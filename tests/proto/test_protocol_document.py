@@ -35,6 +35,7 @@ MESSAGES = (
     messages.Control,
     messages.ControlReply,
     messages.Settings,
+    messages.Claim,
     *METRICS,
 )
 
@@ -92,6 +93,7 @@ def test_every_key_is_documented() -> None:
         keys.receipt("<role>", "<actor>"),
         keys.verdict,
         keys.settings,
+        keys.claim("<role>"),
         keys.request_tutoring,
         keys.request_trial,
         keys.live("<actor>"),

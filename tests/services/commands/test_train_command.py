@@ -158,7 +158,7 @@ def test_a_second_ctrl_c_ends_at_once(
 
 def test_a_second_training_in_the_same_folder_is_refused(tmp_path: Path, data: Path) -> None:
     config, out = tmp_path / "long.yaml", tmp_path / "run"
-    long = {"epochs": 10**6, "publish_every_epochs": None, "checkpoint_every_epochs": 1}
+    long = {"epochs": 10**6, "publish_every_epochs": 10**6, "checkpoint_every_epochs": 1}
     config.write_text(yaml.safe_dump({**CONFIG, "learner": {**CONFIG["learner"], **long}}))
     words = ("train", "--data", data, "--config", config, "--out", out)
     with vmdnn(*words) as first:
