@@ -67,6 +67,8 @@ IDLE_S: Final = 0.3
 OUTBOX_PERIOD_S: Final = 1.0
 OUTBOX_LIMIT: Final = 100
 """An actor plays no more for a receiver that owes it so many receipts."""
+REPORT_WITHIN_S: Final = 15.0
+"""How long an actor waits at its start for receipts of reports that its predecessor died."""
 COMPARE_AGAIN_S: Final = 5.0
 """How long to wait before the settings are compared again, if they differ."""
 PRACTICE_LIMIT: Final = 8
@@ -225,6 +227,7 @@ class Actor:
                 every(LOOK_EVERY_S, self._left.look),
             ):
                 self._left.look()
+                self._report_deaths()
                 while not self._lifecycle.stopping:
                     self._play_next()
         finally:
@@ -259,6 +262,20 @@ class Actor:
     @property
     def _waiting(self) -> int:
         return len(self._sequences) + len(self._rollouts) + len(self._left)
+
+    def _report_deaths(self) -> None:
+        """Send what killed the former process; play nothing before it is known, or it kills again.
+
+        Whoever does not answer is not waited for.
+        """
+        over_s = time.monotonic() + REPORT_WITHIN_S
+        while (deaths := self._sequences.of_dead + self._rollouts.of_dead) > 0:
+            self._sequences.send_due()
+            self._rollouts.send_due()
+            if self._lifecycle.stopping or time.monotonic() > over_s:
+                return
+            self._lifecycle.waits_for(f"receipts for {deaths} reports of the former process")
+            self._lifecycle.wait(0.1)
 
     def _play_next(self) -> None:
         assignment = None

@@ -97,8 +97,8 @@ class Outbox:
         make_folder(folder)
         for unfinished in parts_in(folder):
             unfinished.unlink()
-        for prepared in folder.glob(f"*{PREPARED}"):  # the process that would have deleted it died
-            change_suffix(prepared, ".message")
+        # The process that would have deleted these died.
+        died = [change_suffix(path, ".message") for path in sorted(folder.glob(f"*{PREPARED}"))]
         self._folder = folder
         self._send = send
         self._resend_after_s = resend_after_s
@@ -106,9 +106,9 @@ class Outbox:
         self._clock = clock
         self._lock = threading.Lock()
         self._last_answer_s = clock()
-        self._entries = {
-            path.stem.partition("-")[2]: _Entry(path) for path in sorted(folder.glob("*.message"))
-        }
+        messages = dict.fromkeys((*died, *sorted(folder.glob("*.message"))))
+        self._entries = {_name_of(path): _Entry(path) for path in messages}
+        self._of_dead = frozenset(map(_name_of, died))
         self._put_aside = sum(path.suffix in PUT_ASIDE for path in folder.iterdir())
 
     def __len__(self) -> int:
@@ -118,6 +118,12 @@ class Outbox:
     def put_aside(self) -> int:
         """Number of messages that are kept but not sent any more: refused or damaged ones."""
         return self._put_aside
+
+    @property
+    def of_dead(self) -> int:
+        """Number of messages without an answer that were prepared by a process that died."""
+        with self._lock:
+            return len(self._of_dead & self._entries.keys())
 
     @property
     def missing(self) -> set[Role]:
@@ -252,3 +258,7 @@ class Outbox:
         with self._lock:
             self._put_aside += 1
         LOG.warning("a message %s; it is kept in %s and not sent again", problem, aside)
+
+
+def _name_of(path: Path) -> str:
+    return path.stem.partition("-")[2]

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -23,7 +23,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 900.0
-FAKETIME = Path("/usr/lib/x86_64-linux-gnu/faketime/libfaketime.so.1")
 
 
 def started(
@@ -98,27 +97,36 @@ def test_an_episode_that_kills_its_actor_does_not_hold_up_the_run(tmp_path: Path
     assert "the actor's process died while it played it" in log
 
 
-@pytest.mark.skipif(not FAKETIME.exists(), reason="Debian's package faketime is not installed")
+HOUR_S = 3600
+
+
+def set_clock(file: Path, shift_s: int) -> None:
+    """Shift the wall clock of all processes that look at a file."""
+    with file.open("r+b") as stream:
+        stream.write(shift_s.to_bytes(8, sys.byteorder, signed=True))
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no compiler")
 def test_clocks_that_jump_by_hours_change_nothing(tmp_path: Path) -> None:
-    jump = tmp_path / "jump"
-    jump.write_text("+0")
-    env = {
-        **os.environ,
-        "LD_PRELOAD": str(FAKETIME),
-        "FAKETIME_TIMESTAMP_FILE": str(jump),
-        "FAKETIME_CACHE_DURATION": "1",
-        "FAKETIME_DONT_FAKE_MONOTONIC": "1",  # a monotonic clock does not jump
-    }
-    run = tmp_path / "smoke"
+    clock, library, run = tmp_path / "clock", tmp_path / "clock.so", tmp_path / "smoke"
+    clock.write_bytes(bytes(8))
+    source = ROOT / "tests" / "jumping_clock.c"
+    subprocess.run(("cc", "-O2", "-shared", "-fPIC", "-o", library, source, "-ldl"), check=True)
+    env = {**os.environ, "LD_PRELOAD": str(library), "JUMPING_CLOCK": str(clock)}
+    log = run / "evaluation" / "trials.jsonl"
     process = started(tmp_path, env=env)
+
+    def reached(what: str, has_come: Callable[[], bool]) -> None:
+        eventually(lambda: has_come() or process.poll() is not None, what, PATIENCE_S)
+        assert process.poll() is None
+
     try:
-        eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence", PATIENCE_S)
-        jump.write_text("+5h")
-        eventually(lambda: any(run.glob("policies/*")), "a policy", PATIENCE_S)
-        jump.write_text("-7h")
-        log = run / "evaluation" / "trials.jsonl"
-        eventually(lambda: log.exists() and log.stat().st_size > 0, "a counted trial", PATIENCE_S)
-        jump.write_text("+30h")
+        reached("a sequence", lambda: any(run.glob("tutoring/*.mcap")))
+        set_clock(clock, 5 * HOUR_S)
+        reached("a policy", lambda: any(run.glob("policies/*.safetensors")))
+        set_clock(clock, -7 * HOUR_S)
+        reached("a counted trial", lambda: log.exists() and log.stat().st_size > 0)
+        set_clock(clock, 30 * HOUR_S)
         output = finish(process, tmp_path)
     finally:
         process.kill()
@@ -126,6 +134,9 @@ def test_clocks_that_jump_by_hours_change_nothing(tmp_path: Path) -> None:
     assert "is stuck" not in output
     for part in run.glob("logs/*.log"):
         assert "Traceback" not in part.read_text(), part
+    lines = (run / "logs" / "learner.log").read_text().splitlines()
+    days = {line[:10] for line in lines if line[:2] == "20"}
+    assert len(days) > 1, "the clock has jumped"
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")

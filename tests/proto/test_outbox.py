@@ -129,7 +129,9 @@ def test_a_prepared_message_is_sent_only_if_its_process_died(tmp_path: Path, lin
     new.send_due()
     assert link.sent == [("key/of/it", wire("dies"))]
     assert new.missing == {Role.EVALUATOR}
+    assert (old.of_dead, new.of_dead) == (0, 1)
     new.received("dies", Role.EVALUATOR)
+    assert new.of_dead == 0
     assert suffixes(tmp_path) == []
 
 
