@@ -32,6 +32,8 @@ MINUTES = float(os.environ.get("VMDNN_SOAK_MINUTES", "30"))
 SEED = int(os.environ.get("VMDNN_FAULT_SEED", "1"))
 MOST_ACTORS = 12
 LOOK_EVERY_S = 2.0
+CHANGE_EVERY_S = max(30.0, 3 * MINUTES)
+"""How long the wanted number of actors stays the same."""
 GROWTH_MIB = 16.0
 """Growth of a process from the second third to the last third that is no leak."""
 GROWTH = 0.05
@@ -60,6 +62,8 @@ class Soak:
         self.endpoint = free_endpoint()
         self._chance = random.Random(SEED)
         self._guests: list[subprocess.Popen[bytes]] = []
+        self._wanted = 0
+        self._change_at_s = 0.0
         self.came = 0
         self.mib: dict[str, list[tuple[float, float]]] = defaultdict(list)
         settings = {**SETTINGS, "run.folder": folder, "hub.endpoint": self.endpoint}
@@ -79,17 +83,19 @@ class Soak:
             process.send_signal(signal.SIGINT)
             process.wait(180)
 
-    def come_or_go(self) -> None:
+    def come_or_go(self, at_s: float) -> None:
         """Start an actor, or stop or kill one: from one to twelve, with the run's own."""
         self._guests = [guest for guest in self._guests if guest.poll() is None]
-        wanted = self._chance.randrange(MOST_ACTORS)
-        if len(self._guests) < wanted:
+        if at_s >= self._change_at_s:
+            self._change_at_s = at_s + CHANGE_EVERY_S
+            self._wanted = (self._wanted + self._chance.randrange(4, MOST_ACTORS)) % MOST_ACTORS
+        if len(self._guests) < self._wanted:
             self.came += 1
             name = f"guest-{self.came}"
             command = (sys.executable, "-m", "services.cli", "actor", "--id", name, *self._words)
-            guest = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-            self._guests.append(guest)
-        elif self._guests:
+            with (self.folder / "logs" / "guests.log").open("ab") as log:
+                self._guests.append(subprocess.Popen(command, stdout=log, stderr=log))
+        elif len(self._guests) > self._wanted:
             leaving = self._chance.choice(self._guests)
             leaving.send_signal(self._chance.choice((signal.SIGTERM, signal.SIGKILL)))
 
@@ -126,7 +132,7 @@ def test_memory_stays_flat_while_actors_come_and_go(tmp_path: Path) -> None:
             began_s = now_s()
             most = 0
             while (at_s := now_s() - began_s) < MINUTES * 60:
-                soak.come_or_go()
+                soak.come_or_go(at_s)
                 soak.measure(at_s)
                 most = max(most, len(board.view().living(ActorMetrics)))
                 time.sleep(LOOK_EVERY_S)
@@ -135,6 +141,7 @@ def test_memory_stays_flat_while_actors_come_and_go(tmp_path: Path) -> None:
             ahead_s = 3600.0
             assert len(board.view().vanished_s) == 0, "who is gone for good leaves the view"
     print(f"{MINUTES:g} min, seed {SEED}: {soak.came} actors came, up to {most} at a time")
+    assert most > 2
     print(f"{gone} of them were gone at the end")
     lasting = {
         name: measured
