@@ -301,21 +301,22 @@ def train(
     from learner.training.vmdnn_recipe import VMDNNRecipe  # noqa: PLC0415
     from learner.tutoring.store import TutoringStore  # noqa: PLC0415
     from proto.config import Config as Default  # noqa: PLC0415
+    from proto.run_locks import owned_training  # noqa: PLC0415
     from services.monitoring.training_monitor import monitored  # noqa: PLC0415
 
     config, folder = config or Default(), Path(out)
     task = make(config.task)
     recipe = VMDNNRecipe(config, task.questions, task.distractors)
-    trainer = open_training(recipe, folder, TutoringStore(Path(data)))
+    with owned_training(folder):
+        trainer = open_training(recipe, folder, TutoringStore(Path(data)))
+        with monitored(trainer, folder) as monitor:
 
-    with monitored(trainer, folder) as monitor:
+            def go_on(loss: float) -> bool:
+                monitor.note_epoch()
+                on_epoch(loss)
+                return True
 
-        def go_on(loss: float) -> bool:
-            monitor.note_epoch()
-            on_epoch(loss)
-            return True
-
-        run_training(trainer, folder, go_on)
+            run_training(trainer, folder, go_on)
     return policy_file(folder, trainer.version)
 
 

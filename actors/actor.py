@@ -6,6 +6,7 @@ import logging
 import secrets
 import threading
 import time
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -66,6 +67,8 @@ IDLE_S: Final = 0.3
 OUTBOX_PERIOD_S: Final = 1.0
 OUTBOX_LIMIT: Final = 100
 """An actor plays no more for a receiver that owes it so many receipts."""
+REPORT_WITHIN_S: Final = 15.0
+"""How long an actor waits at its start for receipts of reports that its predecessor died."""
 COMPARE_AGAIN_S: Final = 5.0
 """How long to wait before the settings are compared again, if they differ."""
 PRACTICE_LIMIT: Final = 8
@@ -224,6 +227,7 @@ class Actor:
                 every(LOOK_EVERY_S, self._left.look),
             ):
                 self._left.look()
+                self._report_deaths()
                 while not self._lifecycle.stopping:
                     self._play_next()
         finally:
@@ -258,6 +262,20 @@ class Actor:
     @property
     def _waiting(self) -> int:
         return len(self._sequences) + len(self._rollouts) + len(self._left)
+
+    def _report_deaths(self) -> None:
+        """Send what killed the former process; play nothing before it is known, or it kills again.
+
+        Whoever does not answer is not waited for.
+        """
+        over_s = time.monotonic() + REPORT_WITHIN_S
+        while (deaths := self._sequences.of_dead + self._rollouts.of_dead) > 0:
+            self._sequences.send_due()
+            self._rollouts.send_due()
+            if self._lifecycle.stopping or time.monotonic() > over_s:
+                return
+            self._lifecycle.waits_for(f"receipts for {deaths} reports of the former process")
+            self._lifecycle.wait(0.1)
 
     def _play_next(self) -> None:
         assignment = None
@@ -454,18 +472,19 @@ class Actor:
                 self._bus.publish(live_key, message, check=False)
 
         try:
-            episode = play(
-                self._simulator,
-                assignment.task,
-                assignment.policy,
-                assignment.situation,
-                seed=assignment.seed,
-                kind=assignment.kind,
-                actor=self._bus.id,
-                config_digest=self._agreement.digest,
-                on_step=on_step,
-                conditions=assignment.conditions,
-            )
+            with self._reported_if_killed(assignment):
+                episode = play(
+                    self._simulator,
+                    assignment.task,
+                    assignment.policy,
+                    assignment.situation,
+                    seed=assignment.seed,
+                    kind=assignment.kind,
+                    actor=self._bus.id,
+                    config_digest=self._agreement.digest,
+                    on_step=on_step,
+                    conditions=assignment.conditions,
+                )
         except (_StoppedError, UserError, OSError, MemoryError):
             raise  # nothing is wrong with the episode
         except Exception as error:
@@ -511,7 +530,22 @@ class Actor:
         LOG.warning("the simulation of an episode (%s) failed: %s", failed.kind, problem)
         if failed.kind is Kind.PRACTICE:
             return
-        report = EpisodeFailed(
+        report = self._report_of(failed, problem)
+        outbox, receiver = self._outbox_of(failed.kind)
+        key, wire = self._bus.keys.failure(self._bus.id), encode(report)
+        when_disk_allows(self._lifecycle, lambda: outbox.add(report.id, key, wire, [receiver]))
+
+    def _reported_if_killed(self, played: Assignment) -> AbstractContextManager[None]:
+        """Have the next process report an episode that kills this one, such as by a crash."""
+        if played.kind is Kind.PRACTICE:
+            return nullcontext()
+        report = self._report_of(played, "the actor's process died while it played it", died=True)
+        outbox, receiver = self._outbox_of(played.kind)
+        key = self._bus.keys.failure(self._bus.id)
+        return outbox.sent_if_killed(report.id, key, encode(report), [receiver])
+
+    def _report_of(self, failed: Assignment, problem: str, *, died: bool = False) -> EpisodeFailed:
+        return EpisodeFailed(
             id=secrets.token_hex(16),
             actor=self._bus.id,
             kind=failed.kind,
@@ -521,13 +555,15 @@ class Actor:
             training=failed.training,
             policy_version=failed.policy.version,
             problem=plain(problem)[:1000],
+            died=died,
             conditions=failed.conditions,
         )
-        outbox, receiver = self._sequences, Role.LEARNER
-        if failed.kind is Kind.TRIAL:
-            outbox, receiver = self._rollouts, Role.EVALUATOR
-        key, wire = self._bus.keys.failure(self._bus.id), encode(report)
-        when_disk_allows(self._lifecycle, lambda: outbox.add(report.id, key, wire, [receiver]))
+
+    def _outbox_of(self, kind: Kind) -> tuple[Outbox, Role]:
+        """The outbox of reports about episodes of a kind, and who receives them."""
+        if kind is Kind.TRIAL:
+            return self._rollouts, Role.EVALUATOR
+        return self._sequences, Role.LEARNER
 
     def _on_policy(self, message: PolicyVersion) -> None:
         """Keep the newest policy of this run until the next episode begins."""

@@ -13,7 +13,7 @@ from actors.receipts import Receipts
 from proto.bus import Bus
 from proto.errors import UserError
 from proto.keys import Role
-from proto.outbox import Outbox
+from proto.outbox import PREPARED, Outbox
 from proto.run_locks import only_one
 
 LOG = logging.getLogger(__name__)
@@ -56,7 +56,8 @@ class LeftOutboxes:
     def look(self) -> None:
         """Find outboxes, send what is due, and let go of those that are empty."""
         folders = (self._run_folder / "outbox").glob("*")
-        others = {each.name for each in folders if any(each.glob("*/*.message"))}
+        kept = ("*/*.message", f"*/*{PREPARED}")
+        others = {each.name for each in folders if any(any(each.glob(name)) for name in kept)}
         others -= {self._bus.id, *self._held}
         if others:
             others -= self._bus.present(Role.ACTOR)

@@ -158,7 +158,10 @@ class Learner:
             UserError: the run has a learner already, its evaluator has another configuration, the
                 training diverged, or the disk is full.
         """
-        alone_in_run(self._bus, self._lifecycle)
+        with alone_in_run(self._bus, self._lifecycle):
+            self._run()
+
+    def _run(self) -> None:
         self._agreement.check()
         self._agreement.answer()
         answer_configuration(self._bus, self._config)
@@ -345,7 +348,7 @@ class Learner:
         if self._curriculum.fail(report) or (awaited is not None and awaited.fail(report)):
             self._given_up += 1
             LOG.warning(
-                "the %s of %s with the seed %d is given up, its simulation failed %d times: %s",
+                "the %s of %s with the seed %d is given up, it failed %d times: %s",
                 *(report.kind, report.task, report.seed, TRIES, plain(report.problem)),
             )
         self._answer(report.actor, Receipt(report.id))

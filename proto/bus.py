@@ -50,6 +50,8 @@ SHARED_MEMORY_FROM_BYTES: Final = 64 * 1024
 _CONNECT_AGAIN_S: Final = 1.0
 _SENDERS_REMEMBERED: Final = 1000
 _HEARTBEAT_S: Final = 1.0
+_WAITING_BATCHES: Final = 16
+"""Batches of 64 KiB that may wait in the hub for a receiver; an episode fits into them."""
 
 
 class NoHubError(UserError):
@@ -566,6 +568,19 @@ def open_hub(config: HubConfig, run: str, process: str) -> Bus:
     settings["listen"] = {"endpoints": [config.endpoint], "exit_on_failure": True}
     if certificate is not None:
         settings["access_control"] = hub_access_control(config)
+    # A receiver that does not read must not hold up the senders: for it, and for it alone, messages
+    # are dropped. What must arrive is sent again (`publish_newest`, and `proto.outbox`).
+    settings["qos"] = {
+        "network": [
+            {
+                "messages": ["put"],
+                "flows": ["egress"],
+                "overwrite": {"congestion_control": "drop"},
+            }
+        ]
+    }
+    queue = {"size": {"data": _WAITING_BATCHES}}
+    settings["transport"].setdefault("link", {})["tx"] = {"queue": queue}
     try:
         return Bus(_open(settings), run, Role.HUB, process, certificate)
     except zenoh.ZError as error:

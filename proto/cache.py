@@ -14,8 +14,17 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """`$VMDNN_CACHE`, or `~/.cache/vmdnn`; it need not exist yet."""
-    return Path(os.environ.get("VMDNN_CACHE") or Path.home() / ".cache" / "vmdnn")
+    """`$VMDNN_CACHE`, or `~/.cache/vmdnn`; it need not exist yet.
+
+    A user without a home, as in a container with an arbitrary user id, has a folder among the
+    temporary files.
+    """
+    if named := os.environ.get("VMDNN_CACHE"):
+        return Path(named)
+    try:
+        return Path.home() / ".cache" / "vmdnn"
+    except RuntimeError:  # HOME is not set, and the user has no name
+        return private_folder()
 
 
 def private_folder() -> Path:

@@ -110,6 +110,8 @@ class Outcome:
 
 SIMULATION_FAILED: Final = Outcome(False, False, False, "simulation_failed", {})
 """Outcome of a trial whose simulation failed; it has no measures."""
+NOT_FINISHED: Final = Outcome(False, False, False, "could_not_be_finished", {})
+"""Outcome of a trial that killed each actor that played it; it has no measures."""
 UNKNOWN_OUTCOME: Final = Outcome(False, False, False, "unknown", {})
 """Outcome of a sequence that nobody judged, such as one that was imported."""
 

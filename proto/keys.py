@@ -56,6 +56,10 @@ class Keys:
         """A process that joins asks learner and evaluator: `Settings`, answered by `Settings`."""
         return f"vmdnn/{self.run}/settings"
 
+    def claim(self, role: Role | str) -> str:
+        """A learner or evaluator asks others of its role: `Claim`, answered by `Claim`."""
+        return f"vmdnn/{self.run}/claim/{role}"
+
     @property
     def configuration(self) -> str:
         """A process that joins asks the learner for the `RunConfiguration`."""

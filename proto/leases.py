@@ -47,10 +47,17 @@ class Leases(Generic[Item]):
             lease = self._leases.get(item)
             return None if lease is None else lease.holder
 
-    def finish(self, item: Item) -> None:
-        """End the lease of an item, because it is done or has failed."""
+    def finish(self, item: Item, holder: str | None = None) -> None:
+        """End the lease of an item, because it is done or has failed.
+
+        Args:
+            item: the item.
+            holder: end the lease only if it is this one's; None: whoever has it.
+        """
         with self._lock:
-            self._leases.pop(item, None)
+            lease = self._leases.get(item)
+            if lease is not None and holder in (None, lease.holder):
+                del self._leases[item]
 
     def release(self, holder: str) -> None:
         """End all leases of a holder that has vanished."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import secrets
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,8 +13,8 @@ from typing import Final, Protocol
 from proto.bus import Bus
 from proto.errors import UserError
 from proto.lifecycle import Lifecycle
-from proto.messages import Command, Control, ControlReply
-from proto.metrics import METRICS, Metrics
+from proto.messages import Claim, Command, Control, ControlReply
+from proto.metrics import Metrics
 from proto.periodic import every
 
 LOG = logging.getLogger(__name__)
@@ -21,6 +22,11 @@ LOG = logging.getLogger(__name__)
 METRICS_PERIOD_S: Final = 1.0
 FROZEN_S: Final = 12.0
 """The hub drops the liveliness token of a process that has not answered for this time."""
+LOOK_PERIOD_S: Final = 1.0
+"""How often a process looks whether another one has its role."""
+AWAY_S: Final = 8.0
+"""A process that could not look for this time, because it was frozen or had no hub, may have been
+replaced. Less than the time after which its token is dropped."""
 
 
 class Participant(Protocol):
@@ -61,34 +67,107 @@ def membership(bus: Bus, participant: Participant, lifecycle: Lifecycle) -> Iter
         LOG.exception("the last metrics could not be published")
 
 
-def alone_in_run(bus: Bus, lifecycle: Lifecycle, *, patience_s: float = FROZEN_S) -> None:
-    """Check, across all machines, that no other process of the run has this one's role.
+@contextmanager
+def alone_in_run(bus: Bus, lifecycle: Lifecycle, *, patience_s: float = FROZEN_S) -> Iterator[None]:
+    """Be the only process of this role in the run, on any machine, until the context ends.
 
-    A predecessor that froze keeps its liveliness token for FROZEN_S; so long this one waits. A
-    token whose owner publishes no metrics in this time does not count.
+    Of processes that start at the same time one remains. A process that finds that it was replaced
+    while it was frozen, or had no hub, is asked to stop. A liveliness token whose process does not
+    answer, such as one that is frozen, keeps others waiting for `patience_s` at most.
 
     Raises:
         UserError: another process has this role.
     """
-    heard: set[str] = set()
+    claim = _RoleClaim(bus)
+    problem = _wait_until_alone(claim, bus, lifecycle, patience_s)
+    if problem:
+        raise UserError(problem)
+
+    def look() -> None:
+        nonlocal problem
+        if not problem and (problem := claim.problem()):
+            LOG.error("stops: %s", problem)
+            lifecycle.stop()
+
+    try:
+        with every(LOOK_PERIOD_S, look):
+            yield
+    finally:
+        claim.given_up = True
+    if problem:
+        raise UserError(problem)
+
+
+def _wait_until_alone(claim: _RoleClaim, bus: Bus, lifecycle: Lifecycle, patience_s: float) -> str:
+    """Wait until this process has its role; why it will not get it, or nothing."""
     patience_over_s = time.monotonic() + patience_s
-    listening = False
-    while (others := bus.present(bus.role)) and not lifecycle.stopping:
-        if not listening:
-            bus.subscribe(bus.keys.metrics(bus.role), lambda m: heard.add(m.id), *METRICS)
-            listening = True
-        if time.monotonic() > patience_over_s:
-            if living := others & heard:
-                raise UserError(
-                    f"run {bus.keys.run} has {bus.role.with_article} already "
-                    f"({', '.join(sorted(living))}): "
-                    "stop it, or choose another run with --set run.name=NAME"
-                )
-            LOG.warning("ignores %s, which is present but silent", ", ".join(sorted(others)))
-            return
-        lifecycle.waits_for(f"the end of {bus.role.with_article} that this run has already")
+    while not lifecycle.stopping:
+        if problem := claim.problem():
+            return problem
+        if claim.works:
+            silent = bus.present(bus.role)
+            if not silent:
+                break
+            if time.monotonic() > patience_over_s:
+                LOG.warning("ignores %s, which is present but silent", ", ".join(sorted(silent)))
+                break
+            claim.works = False
+        other = f"the end of {bus.role.with_article} that this run has already"
+        lifecycle.waits_for(other if bus.peers else "the hub")
         lifecycle.wait(0.2)
     lifecycle.waits_for("")
+    return ""
+
+
+class _RoleClaim:
+    """The claim of this process to be the only one of its role in the run.
+
+    Every process answers the others with its claim. Each declares that it answers before it asks,
+    so that of two that start at the same time one at least hears of the other.
+
+    Attributes:
+        works: whether this process has the role; false while it wants to have it.
+        given_up: whether it does not want the role any more.
+    """
+
+    def __init__(self, bus: Bus) -> None:
+        self.works = False
+        self.given_up = False
+        self._bus = bus
+        self._process = secrets.token_hex(8)
+        self._looked_at_s = time.monotonic()
+        bus.answer(
+            bus.keys.claim(bus.role), Claim, lambda _: None if self.given_up else self._now()
+        )
+
+    def problem(self) -> str:
+        """Ask the others; why this process must end, or nothing. If it is alone, it works."""
+        if not self._bus.peers:  # without a hub nobody can be asked
+            return ""
+        ours = self._now()
+        answers = self._bus.ask(self._bus.keys.claim(self._bus.role), ours, Claim)
+        others = [claim for claim in answers if claim.process != ours.process]
+        for other in others:
+            if _goes_before(other, ours):
+                self.given_up = True
+                return (
+                    f"run {self._bus.keys.run} has {self._bus.role.with_article} already "
+                    f"({other.id}): stop it, or choose another run with --set run.name=NAME"
+                )
+        self.works = ours.works or not others
+        self._looked_at_s = time.monotonic()
+        return ""
+
+    def _now(self) -> Claim:
+        was_here = time.monotonic() - self._looked_at_s < AWAY_S
+        return Claim(self._bus.role, self._bus.id, self._process, self.works and was_here)
+
+
+def _goes_before(other: Claim, ours: Claim) -> bool:
+    """Whether another process keeps a role: the one that works, else that of the smaller id."""
+    if other.works != ours.works:
+        return other.works
+    return other.process < ours.process
 
 
 def _certificate_days(bus: Bus) -> int | None:

@@ -103,10 +103,10 @@ class Rollout:
     run_id: Id
 
 
-@message("episode_failed", 1)
+@message("episode_failed", 2)
 @dataclass(frozen=True)
 class EpisodeFailed:
-    """Report that the simulation of a requested episode failed, so that it has no outcome.
+    """Report that a requested episode has no outcome: its simulation failed, or killed the actor.
 
     The episode is handed out again. After three failures the evaluator counts the trial as a
     failure, and the learner gives up the tutored case or correction.
@@ -120,7 +120,8 @@ class EpisodeFailed:
         situation: the situation's values by name.
         training: id of the training that the policy comes from, empty for the tutor.
         policy_version: version of the policy, 0 for the tutor.
-        problem: why the simulation failed.
+        problem: why it has no outcome.
+        died: whether the actor's process died while it played the episode.
         conditions: as in `Episode`.
     """
 
@@ -133,6 +134,7 @@ class EpisodeFailed:
     training: Annotated[str, Text(64)]
     policy_version: Count
     problem: Annotated[str, Text(1000)]
+    died: bool
     conditions: ConditionsField = None
 
     @property
@@ -336,6 +338,26 @@ class Identity:
 
     process: Annotated[str, Text(32, "[0-9a-f]{32}")]
     joined: bool
+
+
+@message("claim", 1, form="json")
+@dataclass(frozen=True)
+class Claim:
+    """A process wants to be the only one of its role in the run, or is so already.
+
+    Question and answer are the same message.
+
+    Attributes:
+        role: the role.
+        id: id of the process; another process may have the same one.
+        process: a random name, which no other process has.
+        works: whether it has the role.
+    """
+
+    role: Role
+    id: Id
+    process: Annotated[str, Text(16, "[0-9a-f]{16}")]
+    works: bool
 
 
 LIVE_SCENE_EVERY: Final = 10

@@ -6,7 +6,8 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -14,7 +15,14 @@ from typing import Final
 from proto.codec import Wire
 from proto.errors import UserError
 from proto.keys import Role
-from proto.storage import change_suffix, make_folder, parts_in, written_whole
+from proto.storage import (
+    StorageError,
+    change_suffix,
+    delete_file,
+    make_folder,
+    parts_in,
+    written_whole,
+)
 
 LOG = logging.getLogger(__name__)
 
@@ -24,6 +32,8 @@ RESEND_AFTER_AT_MOST_S: Final = 30.0
 IN_FLIGHT: Final = 8
 """Messages that wait for an answer at the same time; each waits for RESEND_AFTER_S at most."""
 
+PREPARED: Final = ".prepared"
+"""File suffix of messages that are sent if this process dies."""
 PUT_ASIDE: Final = (".refused", ".damaged")
 """File suffixes of messages that are kept but not sent any more."""
 
@@ -59,6 +69,9 @@ class Outbox:
 
     A file is one line of JSON with key, encoding and receivers, followed by the payload. Used by
     several threads.
+
+    A message can also be prepared for the case that this process dies: the next process that
+    opens the folder sends it.
     """
 
     def __init__(
@@ -84,6 +97,8 @@ class Outbox:
         make_folder(folder)
         for unfinished in parts_in(folder):
             unfinished.unlink()
+        # The process that would have deleted these died.
+        died = [change_suffix(path, ".message") for path in sorted(folder.glob(f"*{PREPARED}"))]
         self._folder = folder
         self._send = send
         self._resend_after_s = resend_after_s
@@ -91,9 +106,9 @@ class Outbox:
         self._clock = clock
         self._lock = threading.Lock()
         self._last_answer_s = clock()
-        self._entries = {
-            path.stem.partition("-")[2]: _Entry(path) for path in sorted(folder.glob("*.message"))
-        }
+        messages = dict.fromkeys((*died, *sorted(folder.glob("*.message"))))
+        self._entries = {_name_of(path): _Entry(path) for path in messages}
+        self._of_dead = frozenset(map(_name_of, died))
         self._put_aside = sum(path.suffix in PUT_ASIDE for path in folder.iterdir())
 
     def __len__(self) -> int:
@@ -103,6 +118,12 @@ class Outbox:
     def put_aside(self) -> int:
         """Number of messages that are kept but not sent any more: refused or damaged ones."""
         return self._put_aside
+
+    @property
+    def of_dead(self) -> int:
+        """Number of messages without an answer that were prepared by a process that died."""
+        with self._lock:
+            return len(self._of_dead & self._entries.keys())
 
     @property
     def missing(self) -> set[Role]:
@@ -122,14 +143,28 @@ class Outbox:
         Raises:
             StorageError: it cannot be written; then it is not sent.
         """
-        path = self._folder / f"{time.time_ns()}-{name}.message"
-        values = {"key": key, "encoding": wire.encoding, "receivers": sorted(receivers)}
-        header = json.dumps(values).encode()
-        with written_whole(path) as stream:
-            stream.write(header + b"\n" + wire.payload)
+        path = self._write(name, ".message", key, wire, receivers)
         with self._lock:
             self._entries[name] = _Entry(path, set(receivers))
         self.send_due()
+
+    @contextmanager
+    def sent_if_killed(
+        self, name: str, key: str, wire: Wire, receivers: Collection[Role] = ()
+    ) -> Iterator[None]:
+        """Have the next process send a message if this one dies before the context ends.
+
+        If the message cannot be written, nothing is prepared. Arguments are those of `add`.
+        """
+        path: Path | None = None
+        with suppress(StorageError):
+            path = self._write(name, PREPARED, key, wire, receivers)
+        try:
+            yield
+        finally:
+            if path is not None:
+                with suppress(StorageError):
+                    delete_file(path)
 
     def received(self, name: str, receiver: Role | None = None) -> None:
         """Delete a message of which all receipts have come. Unknown names are ignored.
@@ -158,6 +193,15 @@ class Outbox:
         """Send what was not sent yet, and again what should have been answered by now."""
         for name, entry in self._take_due():
             self._send_one(name, entry)
+
+    def _write(
+        self, name: str, suffix: str, key: str, wire: Wire, receivers: Collection[Role]
+    ) -> Path:
+        path = self._folder / f"{time.time_ns()}-{name}{suffix}"
+        values = {"key": key, "encoding": wire.encoding, "receivers": sorted(receivers)}
+        with written_whole(path) as stream:
+            stream.write(json.dumps(values).encode() + b"\n" + wire.payload)
+        return path
 
     def _take_due(self) -> list[tuple[str, _Entry]]:
         """Choose the messages to send now and note that they are sent."""
@@ -214,3 +258,7 @@ class Outbox:
         with self._lock:
             self._put_aside += 1
         LOG.warning("a message %s; it is kept in %s and not sent again", problem, aside)
+
+
+def _name_of(path: Path) -> str:
+    return path.stem.partition("-")[2]

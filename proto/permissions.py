@@ -127,6 +127,8 @@ def _rows() -> Iterator[Row]:
     )
     yield _row(keys.configuration, ((evaluator, recorder, actor), (query,)), (learner, (reply,)))
     yield _row(keys.identity(ACTOR_ID), (actor, (query, reply)))
+    for role in (Role.LEARNER, Role.EVALUATOR):
+        yield _row(keys.claim(role), (HOLDER_OF[role], (query, reply)))
     yield _row(keys.live(ACTOR_ID), (actor, (put,)), (_LOOKERS, (subscribe,)))
     for role in _MEMBERS:
         name = ACTOR_ID if role is Role.ACTOR else _ID

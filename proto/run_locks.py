@@ -67,6 +67,24 @@ def single_process(run_folder: Path, role: Role, wanted: str | None) -> Iterator
 
 
 @contextmanager
+def owned_training(folder: Path) -> Iterator[None]:
+    """Hold the lock of whoever trains in a folder until the context ends.
+
+    It is that of a run's learner, so nobody trains in the folder of a run that is being played.
+
+    Raises:
+        UserError: another process trains there.
+    """
+    with _lock(folder, f"{Role.LEARNER}-{Role.LEARNER}") as held:
+        if not held:
+            raise UserError(
+                f"another process trains in {folder} already: wait until it has ended, or choose "
+                "another folder"
+            )
+        yield
+
+
+@contextmanager
 def own_id(
     run_folder: Path,
     role: Role,

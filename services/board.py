@@ -22,6 +22,9 @@ from proto.metrics import (
 )
 
 M = TypeVar("M", bound=Metrics)
+FORGET_AFTER_S: Final = 600.0
+"""An actor or a viewer that has been gone for this time is not shown any more."""
+_COME_AND_GO: Final = (Role.ACTOR, Role.WATCH)
 PROCESSES_KEPT: Final = 10_000
 """A board keeps the metrics of so many processes."""
 ProcessKey = tuple[Role, str]
@@ -34,7 +37,8 @@ class RunView:
 
     Attributes:
         run: name of the run.
-        metrics: the newest metrics of every process that has published any.
+        metrics: the newest metrics of every process that has published any; those that came last
+            are the last.
         vanished_s: Unix time at which a process vanished, of those that have.
     """
 
@@ -59,7 +63,7 @@ class RunView:
     def suites(self) -> Sequence[SuiteScore]:
         """What was counted in each suite, in the evaluator's newest metrics."""
         evaluators = [m for m in self.metrics.values() if isinstance(m, EvaluatorMetrics)]
-        return max(evaluators, key=lambda m: m.time_s).suites if evaluators else ()
+        return evaluators[-1].suites if evaluators else ()
 
     @property
     def policy_version(self) -> int:
@@ -81,13 +85,19 @@ class RunView:
 class Board:
     """Collects the metrics and the presence of all processes of the bus's run."""
 
-    def __init__(self, bus: Bus) -> None:
-        """Start to listen; it ends when the bus is closed."""
+    def __init__(self, bus: Bus, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Start to listen; it ends when the bus is closed.
+
+        Args:
+            bus: connection to the run's processes.
+            clock: gives the time in seconds; it must not jump.
+        """
         self._run = bus.keys.run
+        self._clock = clock
         self._changed = threading.Condition()
         self._metrics: dict[ProcessKey, Metrics] = {}
         self._present: set[ProcessKey] = set()
-        self._vanished_s: dict[ProcessKey, float] = {}
+        self._vanished_at_s: dict[ProcessKey, float] = {}  # by the clock
         for role in Role:
             bus.watch_presence(role, self._presence_of(role))
         bus.subscribe(bus.keys.metrics(), self._keep, *METRICS)
@@ -98,9 +108,12 @@ class Board:
         Metrics of a process that never was present are left out: anybody could send them.
         """
         with self._changed:
-            known = self._present | self._vanished_s.keys()
+            self._forget()
+            known = self._present | self._vanished_at_s.keys()
             metrics = {process: m for process, m in self._metrics.items() if process in known}
-            return RunView(self._run, metrics, dict(self._vanished_s))
+            began_s = time.time() - self._clock()
+            vanished = {process: began_s + at_s for process, at_s in self._vanished_at_s.items()}
+            return RunView(self._run, metrics, vanished)
 
     def wait_for_all(self, timeout_s: float) -> RunView:
         """Wait until every living process has published metrics, or the time is up.
@@ -117,20 +130,29 @@ class Board:
     def _keep(self, metrics: Metrics) -> None:
         process = (metrics.role, metrics.id)
         with self._changed:
-            if process not in self._metrics and len(self._metrics) >= PROCESSES_KEPT:
+            before = self._metrics.pop(process, None)
+            if before is None and len(self._metrics) >= PROCESSES_KEPT:
                 return
             self._metrics[process] = metrics
             self._changed.notify_all()
+
+    def _forget(self) -> None:
+        """Forget actors and viewers that are gone for good."""
+        now_s = self._clock()
+        for process, at_s in list(self._vanished_at_s.items()):
+            if process[0] in _COME_AND_GO and now_s - at_s >= FORGET_AFTER_S:
+                del self._vanished_at_s[process]
+                self._metrics.pop(process, None)
 
     def _presence_of(self, role: Role) -> Callable[[str, bool], None]:
         def on_change(name: str, lives: bool) -> None:
             with self._changed:
                 if lives:
                     self._present.add((role, name))
-                    self._vanished_s.pop((role, name), None)
+                    self._vanished_at_s.pop((role, name), None)
                 else:
                     self._present.discard((role, name))
-                    self._vanished_s[role, name] = time.time()
+                    self._vanished_at_s[role, name] = self._clock()
                 self._changed.notify_all()
 
         return on_change

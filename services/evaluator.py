@@ -103,7 +103,10 @@ class Evaluator:
             UserError: the run has an evaluator already, its learner has another configuration, or a
                 trial cannot be written to disk.
         """
-        alone_in_run(self._bus, self._lifecycle)
+        with alone_in_run(self._bus, self._lifecycle):
+            self._run()
+
+    def _run(self) -> None:
         self._agreement.check()
         self._agreement.answer()
         make_folder(self._folder)  # shows the next process that there was one before
@@ -260,7 +263,7 @@ class Evaluator:
             policy = (report.training, report.policy_version)
             trial = (policy, report.suite, report.seed)
             if not self._failures.counts(trial, report.id):  # the trial may be played again now
-                self._leases.finish(trial)
+                self._leases.finish(trial, report.actor)
             # Otherwise the trial is handed out again.
             if self._failures.add(trial, report.id) and self._count_failure(report):
                 _report_trial(report, report.problem)

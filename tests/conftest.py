@@ -82,6 +82,7 @@ def failure() -> Callable[..., EpisodeFailed]:
             training="",
             policy_version=0,
             problem="episode.joints_deg: expected finite numbers, got NaN or infinity",
+            died=False,
         )
         return replace(report, **given)
 

@@ -127,7 +127,10 @@ class Round:
                 seed for seed, plan in self._missing.items() if self._fits(plan, request.player)
             )
             seed = self._leases.take(request.actor, playable)
-            return None if seed is None else self._missing[seed]
+            if seed is None:
+                return None
+            self._failures.ask(seed, request.actor)
+            return self._missing[seed]
 
     def is_played_by(self, player: Player) -> bool:
         """Whether a player can help with what the round waits for: corrections, or practice."""
@@ -156,19 +159,18 @@ class Round:
                 self._leases.finish(shown.seed)
 
     def fail(self, report: EpisodeFailed) -> bool:
-        """Note that the simulation of a correction failed; whether it is given up for that.
+        """Note that a correction could not be shown; whether it is given up for that.
 
-        Otherwise it is handed out again. The report of an actor that does not play it at present
-        is ignored.
+        Otherwise it is handed out again. The report of an actor that was not asked is ignored.
         """
         with self._lock:
             if not self._is_of_policy(report) or report.seed not in self._missing:
                 return False
             if self._failures.counts(report.seed, report.id):
                 return False
-            if self._leases.holder(report.seed) != report.actor:
+            if not self._failures.take_request(report.seed, report.actor):
                 return False
-            self._leases.finish(report.seed)
+            self._leases.finish(report.seed, report.actor)
             if not self._failures.add(report.seed, report.id):
                 return False
             del self._missing[report.seed]

@@ -61,7 +61,10 @@ class Curriculum:
     def next_case(self, actor: str) -> TutoringCase | None:
         """A case for this actor to demonstrate; None if none is left."""
         with self._lock:
-            return self._leases.take(actor, self._missing.values())
+            case = self._leases.take(actor, self._missing.values())
+            if case is not None:
+                self._failures.ask(_key(case), actor)
+            return case
 
     def release(self, actor: str) -> None:
         """Hand out again what an actor that vanished was demonstrating."""
@@ -85,10 +88,9 @@ class Curriculum:
                 self._leases.finish(self._missing.pop(_key(shown)))
 
     def fail(self, report: EpisodeFailed) -> bool:
-        """Note that the simulation of a case failed; whether the case is given up for that.
+        """Note that a case could not be shown; whether the case is given up for that.
 
-        Otherwise it is handed out again. The report of an actor that does not play the case at
-        present is ignored.
+        Otherwise it is handed out again. The report of an actor that was not asked is ignored.
         """
         with self._lock:
             if not self._lacks(report):
@@ -96,9 +98,9 @@ class Curriculum:
             key = _key(report)
             if self._failures.counts(key, report.id):
                 return False
-            if self._leases.holder(self._missing[key]) != report.actor:
+            if not self._failures.take_request(key, report.actor):
                 return False
-            self._leases.finish(self._missing[key])
+            self._leases.finish(self._missing[key], report.actor)
             if not self._failures.add(key, report.id):
                 return False
             del self._missing[key]

@@ -1,7 +1,8 @@
-"""Sequences that cannot be recorded because their simulation fails again and again."""
+"""Sequences that cannot be recorded: their simulation fails, or kills the actor, every time."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable
 from typing import Final, Generic, Protocol, TypeVar
 
@@ -9,7 +10,7 @@ from proto.episode import Kind
 from proto.suites import Conditions
 
 TRIES: Final = 3
-"""After so many failed simulations a sequence is not asked for any more."""
+"""After so many failures a sequence is not asked for any more."""
 
 Item = TypeVar("Item", bound=Hashable)
 
@@ -43,10 +44,25 @@ class Shown(Protocol):
 
 
 class Failures(Generic[Item]):
-    """Counts how often the simulation of each item failed."""
+    """Counts how often each item failed.
+
+    An actor that died reports its failure after its lease has ended, so each request is noted here.
+    """
 
     def __init__(self) -> None:
         self._reports: dict[Item, set[str]] = {}
+        self._asked: Counter[tuple[Item, str]] = Counter()
+
+    def ask(self, item: Item, actor: str) -> None:
+        """Note that an actor was asked for an item, so that it may report a failure of it once."""
+        self._asked[item, actor] += 1
+
+    def take_request(self, item: Item, actor: str) -> bool:
+        """Whether an actor was asked for an item and has not reported this request's failure."""
+        if not self._asked[item, actor]:
+            return False
+        self._asked[item, actor] -= 1
+        return True
 
     def counts(self, item: Item, report: str) -> bool:
         """Whether a report of an item was counted before; it may come again, late."""

@@ -17,8 +17,11 @@ from learner.training.coupled import CoupledTraining
 from learner.training.trainer import Trainer
 from learner.training.training_run import open_training, run_training
 from learner.training.vmdnn_recipe import VMDNNRecipe
+from learner.tutoring.store import TutoringStore
 from proto.body import ARM, FOCUS, GRASP, NECK
+from proto.config import Config
 from proto.metrics import Stage
+from proto.run_locks import owned_training
 from services.arguments.common import add_config, config_of
 from services.arguments.training import add_training_data, interruption, training_stores
 from services.monitoring.training_monitor import monitored
@@ -42,7 +45,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Train until the end or Ctrl-C; the run's folder then contains checkpoints and policies."""
     config = config_of(arguments)
     store, others = training_stores(arguments)
-    folder: Path = arguments.out
+    with owned_training(arguments.out):
+        return _train(config, arguments.out, store, others)
+
+
+def _train(config: Config, folder: Path, store: TutoringStore, others: TutoringStore | None) -> int:
     task = make_task(config.task)
     pretraining_task = task if others is None else make_pretraining_task(config)
     recipe = VMDNNRecipe(config, pretraining_task.questions, task.distractors)

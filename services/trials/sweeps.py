@@ -26,6 +26,7 @@ from proto.config import Config, RivalKind, load_config
 from proto.episode import Outcome
 from proto.errors import UserError
 from proto.metrics import Stage
+from proto.run_locks import owned_training
 from proto.storage import written_whole
 from services.trials.trial_playing import LoggedPolicy, play_missing_trials
 
@@ -130,14 +131,15 @@ def train(
             from those of `store` only.
         go_on: called with the loss after each epoch; False stops the training.
     """
-    before, started = training_s(run), time.process_time()
     first_store = pretraining_store if run.variant.rival is None else None
-    try:
-        trainer = open_training(run.recipe(), run.folder, store, first_store)
-        run_training(trainer, run.folder, go_on)
-        return trainer.finished
-    finally:
-        _save_training_s(run, before + time.process_time() - started)
+    with owned_training(run.folder):
+        before, started = training_s(run), time.process_time()
+        try:
+            trainer = open_training(run.recipe(), run.folder, store, first_store)
+            run_training(trainer, run.folder, go_on)
+            return trainer.finished
+        finally:
+            _save_training_s(run, before + time.process_time() - started)
 
 
 def training_s(run: SweepRun) -> float:

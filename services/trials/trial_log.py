@@ -20,7 +20,14 @@ from proto.codec import (
     record_of,
     schema_of,
 )
-from proto.episode import SIMULATION_FAILED, ConditionsField, Episode, Id, Outcome
+from proto.episode import (
+    NOT_FINISHED,
+    SIMULATION_FAILED,
+    ConditionsField,
+    Episode,
+    Id,
+    Outcome,
+)
 from proto.errors import UserError
 from proto.messages import Count, EpisodeFailed, Rollout
 from proto.recordings import format1
@@ -170,7 +177,7 @@ class TrialLog:
         return self._add(CountedTrial.of(rollout.episode, rollout.run_id))
 
     def add_failure(self, report: EpisodeFailed) -> bool:
-        """Count a trial whose simulation failed as a failure; otherwise as `add`."""
+        """Count a trial that has no outcome as a failure; otherwise as `add`."""
         return self._add(
             CountedTrial(
                 run_id=report.training,
@@ -179,7 +186,7 @@ class TrialLog:
                 episode=report.id,
                 actor=report.actor,
                 situation=report.situation,
-                outcome=SIMULATION_FAILED,
+                outcome=NOT_FINISHED if report.died else SIMULATION_FAILED,
                 format=_format_with(report.conditions),
                 conditions=report.conditions,
             )

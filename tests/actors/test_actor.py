@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadly_simulator import DEADLY_CASE, DEADLY_SEED
 from fitting import make_policy
 from ports import free_endpoint
-from processes import eventually, listening_hub, stop, vmdnn
+from processes import PATIENCE_S, eventually, listening_hub, stop, vmdnn
 
 from actors.left_outboxes import LeftOutboxes
 from actors.receipts import Receipts
@@ -415,6 +416,33 @@ def test_a_failed_simulation_is_reported_to_learner_and_evaluator(
     assert metrics.episodes == 1
     assert [episode.seed for episode in setup.sequences] == [5000]
     assert setup.actor.poll() is None
+
+
+def test_an_episode_that_kills_the_actor_is_reported_by_the_next_one(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    words = ("--set", "simulator.backend=tests.deadly_simulator:DeadlySimulator")
+    setup.cases += [TutoringCase("experiment1", 5, 0), TutoringCase("experiment1", DEADLY_CASE, 0)]
+    setup.start_actor(*words)
+    setup.actor.wait(PATIENCE_S)
+    assert setup.failures == []
+    assert [path.suffix for path in setup.outbox.glob("*/*")] == [".prepared"]
+    setup.publish(policy(4))
+    setup.start_actor(*words, "--set", "actor.practice=false")
+    eventually(lambda: len(setup.failures) == 1, "the case is reported")
+    eventually(lambda: setup.holds("training", 4), "it holds the policy")
+    setup.trials.append(Trial(DEADLY_SEED))
+    setup.actor.wait(PATIENCE_S)
+    setup.start_actor(*words)
+    eventually(lambda: len(setup.failures) == 2, "the trial is reported")
+    case, trial = setup.failures
+    assert (case.kind, case.seed, case.died) == (Kind.TUTORING, 1000 * DEADLY_CASE, True)
+    assert (trial.kind, trial.seed, trial.died) == (Kind.TRIAL, DEADLY_SEED, True)
+    assert (trial.training, trial.policy_version, trial.actor) == ("training", 4, "actor-1")
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
+    setup.actor.kill()
+    setup.actor.wait(PATIENCE_S)
+    assert [episode.seed for episode in setup.sequences] == [5000]
 
 
 def test_it_plays_trials_and_practises_under_the_conditions_of_suites(

@@ -103,6 +103,21 @@ def test_a_process_with_bad_input_ends_the_run_with_its_message(tmp_path: Path) 
     assert not processes_that_name(str(tmp_path))
 
 
+def test_a_link_to_the_script_works(tmp_path: Path) -> None:
+    link = tmp_path / "play"
+    link.symlink_to(ROOT / "deploy" / "run_local.sh")
+    ended = subprocess.run(
+        (link, "--set", "learner.ratee=1"),
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode == 2
+    assert "learner.ratee" in ended.stderr
+
+
 @pytest.mark.parametrize(
     ("setting", "said"),
     [

@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from ports import free_endpoint
@@ -104,7 +105,7 @@ class FaultyRun:
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGCONT)
 
-    def counted(self) -> list[dict[str, object]]:
+    def counted(self) -> list[dict[str, Any]]:
         log = self.folder / "evaluation" / "trials.jsonl"
         lines = log.read_text().splitlines() if log.exists() else []
         return [json.loads(line) for line in lines]
@@ -136,12 +137,13 @@ def test_nothing_is_lost_by_random_faults(tmp_path: Path) -> None:
     each = Counter((trial["policy_version"], trial["seed"]) for trial in counted)
     assert set(each.values()) == {1}, "each trial is counted once"
     assert len({trial["run_id"] for trial in counted}) == 1
+    unfinished = "could_not_be_finished"  # its actor was killed three times
     for trial in counted:
+        if trial["outcome"]["reason"] == unfinished:
+            continue
         recorded = read_episode(run.folder / "rollouts" / f"{trial['episode']}.mcap")
         assert (recorded.policy_version, recorded.seed) == (trial["policy_version"], trial["seed"])
-        outcome = trial["outcome"]
-        assert isinstance(outcome, dict)
-        assert recorded.outcome.precise == outcome["precise"]
+        assert recorded.outcome.precise == trial["outcome"]["precise"]
     shown = [read_episode(path).seed for path in (run.folder / "tutoring").glob("*.mcap")]
     assert sorted(shown) == [1000 * case for case in CASES], "each case is stored once"
     versions = [

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from subprocess import Popen
 
 import pytest
@@ -29,6 +31,7 @@ from proto.messages import (
     TutoringCase,
     TutoringRequest,
 )
+from proto.outbox import Outbox
 from proto.suites import Player
 
 KEYS = Keys("test")
@@ -255,6 +258,38 @@ def test_everything_reconnects_after_the_hub_was_killed() -> None:
         eventually(lambda: presence[-1] == ("actor", True), "the actor is present again")
         eventually(lambda: versions[-1] == 2, "what was published without a hub arrives")
         eventually(lambda: answers() != [], "questions are answered again")
+
+
+@pytest.mark.parametrize("away_s", [0.0, pytest.param(60.0, marks=pytest.mark.slow)])
+def test_a_new_hub_that_knows_nothing_serves_late_joiners_and_outboxes(
+    tmp_path: Path, away_s: float
+) -> None:
+    with network() as net:
+        learner, actor = net.join(Role.LEARNER, "learner"), net.join(Role.ACTOR, "actor")
+        arrived: list[TutoringCase] = []
+        versions: list[int] = []
+        key = KEYS.sequence("actor")
+        learner.subscribe(key, arrived.append, TutoringCase)
+        learner.publish_newest(KEYS.policy, policy(7))
+        outbox = Outbox(tmp_path, actor.deliver_wire, resend_after_s=1.0)
+
+        net.hub.kill()
+        net.hub.wait()
+        lost_at_s = time.monotonic()
+        eventually(lambda: actor.peers == 0, "the hub is missed")
+        kept = TutoringCase("experiment1", 3, 1)
+        outbox.add("episode", key, encode(kept))  # into the void
+        eventually(lambda: time.monotonic() >= lost_at_s + away_s, "it is away", away_s + 10)
+        net.start_hub()
+
+        def is_resent() -> bool:
+            outbox.send_due()
+            return kept in arrived
+
+        eventually(is_resent, "the outbox goes on")
+        late = net.join(Role.ACTOR, "late")
+        late.subscribe_newest(KEYS.policy, lambda new: versions.append(new.version), PolicyVersion)
+        eventually(lambda: versions == [7], "the newest policy for who comes late")
 
 
 def test_presence_ends_with_the_process(shared: Network) -> None:

@@ -117,6 +117,24 @@ def test_a_new_process_sends_the_messages_of_the_old_one_in_order(
     assert len(Outbox(tmp_path, Link())) == 1
 
 
+def test_a_prepared_message_is_sent_only_if_its_process_died(tmp_path: Path, link: Link) -> None:
+    old = Outbox(tmp_path, link)
+    with old.sent_if_killed("lives", "key", wire("lives")):
+        assert suffixes(tmp_path) == [".prepared"]
+    assert suffixes(tmp_path) == []
+    dies = old.sent_if_killed("dies", "key/of/it", wire("dies"), [Role.EVALUATOR])
+    dies.__enter__()
+    assert (len(old), link.sent) == (0, [])
+    new = Outbox(tmp_path, link)
+    new.send_due()
+    assert link.sent == [("key/of/it", wire("dies"))]
+    assert new.missing == {Role.EVALUATOR}
+    assert (old.of_dead, new.of_dead) == (0, 1)
+    new.received("dies", Role.EVALUATOR)
+    assert new.of_dead == 0
+    assert suffixes(tmp_path) == []
+
+
 def test_the_oldest_messages_are_sent_first_and_not_all_at_once(outbox: Outbox, link: Link) -> None:
     names = fill(outbox, "m", IN_FLIGHT + 3)
     assert link.take() == names[:IN_FLIGHT]

@@ -38,6 +38,7 @@ MESSAGES = (
     messages.ConfigurationRequest,
     messages.RunConfiguration,
     messages.Identity,
+    messages.Claim,
     *METRICS,
 )
 
@@ -97,6 +98,7 @@ def test_every_key_is_documented() -> None:
         keys.settings,
         keys.configuration,
         keys.identity("<actor>"),
+        keys.claim("<role>"),
         keys.request_tutoring,
         keys.request_trial,
         keys.live("<actor>"),

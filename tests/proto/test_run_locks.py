@@ -12,7 +12,7 @@ import pytest
 
 from proto.errors import UserError
 from proto.keys import Role
-from proto.run_locks import only_one, own_id, single_process
+from proto.run_locks import only_one, own_id, owned_training, single_process
 
 
 def test_ids_are_free_names_of_this_host(tmp_path: Path) -> None:
@@ -65,6 +65,17 @@ def test_a_single_process_locks_the_folder_whatever_its_id(tmp_path: Path) -> No
             pass
         with single_process(tmp_path, Role.EVALUATOR, "mine") as other_role:
             assert other_role == "mine"
+
+
+def test_nobody_trains_in_the_folder_of_a_learner(tmp_path: Path) -> None:
+    with single_process(tmp_path, Role.LEARNER, "mine"):
+        refused = pytest.raises(UserError, match=f"another process trains in {tmp_path} already")
+        with refused, owned_training(tmp_path):
+            pass
+    with owned_training(tmp_path):
+        refused = pytest.raises(UserError, match="a learner")
+        with refused, single_process(tmp_path, Role.LEARNER, None):
+            pass
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:

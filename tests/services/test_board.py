@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -16,7 +17,7 @@ from proto.config import HubConfig
 from proto.keys import Role
 from proto.metrics import ActorMetrics, Metrics
 from proto.periodic import every
-from services.board import Board
+from services.board import FORGET_AFTER_S, Board
 from services.cli import main
 
 
@@ -55,6 +56,29 @@ def test_the_newest_metrics_are_kept_and_dead_processes_vanish(hub: HubConfig) -
         assert board.view().living(ActorMetrics) == []
         with join_as(hub, ACTOR):
             eventually(lambda: process not in board.view().vanished_s, "the actor is present again")
+
+
+def test_an_actor_that_is_gone_for_good_is_forgotten(hub: HubConfig) -> None:
+    now_s = 1000.0
+    actor, learner = (Role.ACTOR, "a-1"), (Role.LEARNER, "l")
+    with (
+        open_bus(hub, RUN, Role.WATCH, "w") as bus,
+        join_as(hub, ACTOR) as mortal,
+        join_as(hub, LEARNER) as needed,
+    ):
+        board = Board(bus, clock=lambda: now_s)
+        publish(mortal, ACTOR)
+        publish(needed, LEARNER)
+        eventually(lambda: len(board.view().metrics) == 2, "both are known")
+        mortal.close()
+        needed.close()
+        eventually(lambda: len(board.view().vanished_s) == 2, "both have vanished")
+        now_s += FORGET_AFTER_S - 1.0
+        since_s = time.time() - board.view().vanished_s[actor]
+        assert abs(since_s - FORGET_AFTER_S) < 30.0
+        now_s += 1.0
+        view = board.view()
+        assert set(view.vanished_s) == set(view.metrics) == {learner}, "a run needs its learner"
 
 
 def test_other_runs_are_not_seen(hub: HubConfig) -> None:

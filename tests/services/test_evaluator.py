@@ -320,6 +320,27 @@ def test_a_trial_whose_simulation_fails_three_times_is_a_failure(
     assert setup.ask_until_given(actor, 1) == 71
 
 
+def test_a_trial_that_kills_three_actors_is_a_failure(
+    setup: EvaluatorSetup, failure: Callable[..., EpisodeFailed]
+) -> None:
+    trial = {"kind": Kind.TRIAL, "training": "training", "policy_version": 1, "seed": 70}
+    trial |= {"situation": dict(TASK.sample(70)), "died": True}
+    setup.publish(1)
+    for attempt in range(3):
+        with open_bus(HubConfig(endpoint=setup.endpoint), "test", Role.ACTOR, "mortal") as mortal:
+            mortal.announce()
+            assert setup.ask_until_given(mortal, 1) == 70
+        # The next process of this actor reports what its predecessor died of.
+        heir = setup.join(Role.ACTOR, "mortal")
+        assert setup.fail(heir, failure(f"death-{attempt}", actor="mortal", **trial)) == ""
+    metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 1})
+    assert metrics.policies[0].reasons == {"could_not_be_finished": 1}
+    setup.restart()
+    assert setup.ask_until_given(setup.join(Role.ACTOR, "other"), 1) == 71
+    metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 1})
+    assert metrics.policies[0].reasons == {"could_not_be_finished": 1}
+
+
 def test_a_trial_of_a_dead_actor_is_assigned_to_another(setup: EvaluatorSetup) -> None:
     mortal, other = setup.join(Role.ACTOR, "mortal"), setup.join(Role.ACTOR, "other")
     mortal.announce()

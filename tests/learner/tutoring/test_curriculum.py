@@ -129,6 +129,20 @@ def test_a_case_whose_simulation_fails_repeatedly_is_given_up(
     assert not plan.fail(failure("of-no-case", seed=5))
 
 
+def test_a_case_that_kills_its_actors_is_given_up(failure: Callable[..., EpisodeFailed]) -> None:
+    plan = curriculum(cases=(0,), repeats=1)
+    for attempt in range(TRIES):
+        assert plan.next_case("mortal") == case(0, 0)
+        plan.release("mortal")
+        assert plan.next_case("other") == case(0, 0), "somebody else plays it at once"
+        report = failure(f"{attempt}", actor="mortal", seed=0, died=True)
+        assert not plan.fail(failure(f"{attempt}-of-another-actor", actor="stranger", seed=0))
+        assert plan.fail(report) == (attempt == TRIES - 1)
+        assert plan.next_case("third") is None, "the other one still plays it, or it is given up"
+        plan.release("other")
+    assert (plan.missing, plan.size("experiment1")) == (0, 0)
+
+
 def test_an_unknown_case_is_named() -> None:
     with pytest.raises(UserError, match=r"no case 45; the task experiment1 has .* 0 to 44"):
         curriculum(cases=(3, 45))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from processes import PATIENCE_S, eventually, run_vmdnn, vmdnn
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from learner.checkpoint import load_checkpoint, policy_file, pretraining_file, training_file
@@ -153,6 +154,23 @@ def test_a_second_ctrl_c_ends_at_once(
 
     monkeypatch.setattr(Trainer, "epoch", press_twice)
     assert train(tmp_path / "run") == 130
+
+
+def test_a_second_training_in_the_same_folder_is_refused(tmp_path: Path, data: Path) -> None:
+    config, out = tmp_path / "long.yaml", tmp_path / "run"
+    long = {"epochs": 10**6, "publish_every_epochs": 10**6, "checkpoint_every_epochs": 1}
+    config.write_text(yaml.safe_dump({**CONFIG, "learner": {**CONFIG["learner"], **long}}))
+    words = ("train", "--data", data, "--config", config, "--out", out)
+    with vmdnn(*words) as first:
+        eventually(lambda: training_file(out).exists(), "a checkpoint")
+        second = run_vmdnn(*words, "--set", "learner.rate=0.5")
+        assert second.returncode == 2
+        assert f"another process trains in {out} already" in second.stderr
+        assert first.poll() is None
+        first.send_signal(signal.SIGINT)
+        assert first.wait(PATIENCE_S) == 130
+    assert yaml.safe_load((out / "config.yaml").read_text())["learner"]["rate"] != 0.5
+    assert load_checkpoint(training_file(out)).metadata.epoch > 0
 
 
 def complaint_of(status: int, capsys: pytest.CaptureFixture[str]) -> str:
