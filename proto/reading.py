@@ -1,0 +1,31 @@
+"""Reading files whose size is not trusted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from proto.errors import UserError
+
+
+class TooLargeError(UserError):
+    """A file is larger than any file of its kind."""
+
+
+def read_limited(path: Path, most: int) -> bytes:
+    """Read a whole file; nothing is read if it is too large.
+
+    Args:
+        path: the file.
+        most: largest size (bytes).
+
+    Raises:
+        TooLargeError: it is larger.
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as stream:
+        size = path.stat().st_size
+        # One byte more than allowed, because some files, such as devices, do not tell their size.
+        content = b"" if size > most else stream.read(most + 1)
+    if size > most or len(content) > most:
+        raise TooLargeError(f"{path} is larger than {most} bytes, which no such file is")
+    return content
