@@ -232,6 +232,17 @@ class Outbox:
         LOG.warning("a message %s; it is kept in %s and not sent again", problem, aside)
 
 
+def message_problem(path: Path) -> str:
+    """Return why a file of an outbox is damaged; empty if it is not, or is gone."""
+    try:
+        _read_message(path)
+    except FileNotFoundError:
+        return ""
+    except _DAMAGE as error:
+        return f"it is damaged ({plain(error, 300) or type(error).__name__})"
+    return ""
+
+
 def _read_message(path: Path) -> tuple[str, set[Role], Wire]:
     """Key, receivers and message of a file.
 

@@ -224,6 +224,7 @@ class EpisodeSummary:
     phases: NDArray[np.uint8]
     actions: Floats
     targets: Floats
+    outcome: Outcome
 
 
 def read_summary(path: Path) -> EpisodeSummary:
@@ -251,6 +252,7 @@ def read_summary(path: Path) -> EpisodeSummary:
             phases=np.array([step.phase - 1 for step in steps], dtype=np.uint8),
             actions=_floats([_action(step.action) for step in steps], shape),
             targets=_floats([_action(step.target) for step in steps], shape),
+            outcome=_outcome(contents.metadata),
         )
     except _BROKEN as error:
         raise _not_an_episode(path, error) from error

@@ -108,7 +108,7 @@ def read_trials(path: Path) -> list[CountedTrial]:
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     try:
-        return [_parse_line(line) for line in lines]
+        return [parse_line(line) for line in lines]
     except MessageError as error:
         raise UserError(
             f"{path} is not a file of counted trials ({error});"
@@ -116,7 +116,7 @@ def read_trials(path: Path) -> list[CountedTrial]:
         ) from error
 
 
-def _parse_line(line: bytes) -> CountedTrial:
+def parse_line(line: bytes) -> CountedTrial:
     """Parse a line of format 1, 2 or 3.
 
     Raises:
@@ -233,7 +233,7 @@ class TrialLog:
 
     def _read(self, line: bytes, number: int) -> None:
         try:
-            self._count(_parse_line(line))
+            self._count(parse_line(line))
         except MessageError as error:
             self.damaged += 1
             if self.damaged > _TOLD:
