@@ -54,6 +54,9 @@ _START_OF_A_RECORD: Final = re.compile(rb"[\x01-\x0f].{4}\x00{4}", re.DOTALL)
 """A kind of record, and a length below 4 GiB."""
 _MOST_MESSAGES: Final = 40_000
 _BYTES_PER_MESSAGE: Final = 32
+_MOST_OTHERS: Final = 10_000
+_BYTES_PER_OTHER: Final = 256
+"""Of records that are neither messages nor chunks; there are a few in each file."""
 _UNPACKED_BYTES: Final = 16 * 2**20
 _UNPACKED_PER_BYTE: Final = 8
 _LARGEST_CHUNK: Final = 16 * 2**20
@@ -95,18 +98,25 @@ class _Limits:
 
     def __init__(self, size: int) -> None:
         self._messages = _MOST_MESSAGES + size // _BYTES_PER_MESSAGE
+        self._others = _MOST_OTHERS + size // _BYTES_PER_OTHER
         self._bytes = _UNPACKED_BYTES + _UNPACKED_PER_BYTE * size
 
     @property
     def exhausted(self) -> bool:
         """Whether the file has become too large."""
-        return self._messages < 0 or self._bytes < 0
+        return min(self._messages, self._others, self._bytes) < 0
 
     def take_message(self) -> None:
         """Count a message, or another record."""
         self._messages -= 1
         if self._messages < 0:
             raise TooMuchError("it has more messages than any recording of its size")
+
+    def take_other(self) -> None:
+        """Count a record that is neither a message nor a chunk."""
+        self._others -= 1
+        if self._others < 0:
+            raise TooMuchError("it has more records than any recording of its size")
 
     def take_bytes(self, count: int) -> None:
         """Count bytes that are unpacked or examined."""
@@ -140,6 +150,7 @@ def whole_records(content: bytes) -> Iterator[McapRecord]:
         elif kind == Opcode.MESSAGE:
             yield _message(content, frame.begin, frame.end)
         elif kind in _KINDS:
+            limits.take_other()
             record = _record(content, frame)
             _check_sums(content, at, record)
             yield record
@@ -193,6 +204,7 @@ def _salvage(content: bytes, frame: _Frame, limits: _Limits) -> list[McapRecord]
         if frame.kind == Opcode.MESSAGE:
             return [_message(content, frame.begin, frame.end)]
         if frame.kind in _KINDS:
+            limits.take_other()
             limits.take_bytes(frame.end - frame.begin)
             record = _record(content, frame)
             return [record] if _is_as_written(record, content, frame) else None
@@ -275,6 +287,7 @@ def _chunk_records(content: bytes, frame: _Frame, limits: _Limits) -> Iterator[M
         if inner.kind == Opcode.MESSAGE:
             yield _message(data, inner.begin, inner.end)
         elif inner.kind in (Opcode.SCHEMA, Opcode.CHANNEL):
+            limits.take_other()
             yield _record(data, inner)
         at = inner.end
 

@@ -11,6 +11,7 @@ A shorter sequence repeats its last step. EIPL does not name joints.
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -39,6 +40,7 @@ _BROKEN: Final = (
     OverflowError,
     MemoryError,
     zipfile.BadZipFile,
+    tokenize.TokenError,
 )
 """What reading a damaged file raises."""
 _LEAST_RANGE: Final = 1e-2

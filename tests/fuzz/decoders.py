@@ -230,12 +230,13 @@ def _outbox_files(folder: Path) -> list[bytes]:
 
 def _read_outbox(content: bytes, folder: Path) -> None:
     """Every input is sent, or set aside: nothing is raised."""
-    if message_problem(_file(content, folder, "1-e1.message")) and len(content) % 20 == 0:
-        outbox = Outbox(folder, lambda _key, _wire: None)
+    path = _file(content, folder, "read/1-e1.message")
+    if message_problem(path):
+        outbox = Outbox(path.parent, lambda _key, _wire: None)
         outbox.send_due()
         assert len(outbox) == 0
         assert outbox.put_aside == 1
-        (folder / "1-e1.damaged").unlink()
+        path.with_suffix(".damaged").unlink()
 
 
 def _eipl_files(folder: Path) -> list[bytes]:

@@ -49,7 +49,7 @@ def test_values(text: str, value: Any) -> None:
         ("a: !!int x", "'x' is not an integer"),
         ("a: !!bool x", "'x' is not true or false"),
         ("a: !!python/name:os.system", "could not determine a constructor"),
-        ("[" * 5000, "nested too deeply"),
+        ("[" * 5000, "nested deeper than 50"),
     ],
 )
 def test_invalid_yaml_is_refused(text: str, said: str) -> None:
