@@ -232,10 +232,15 @@ class TrialLog:
         return new
 
     def _read(self, line: bytes, number: int) -> None:
+        if len(line) < _SHORTEST_LINE:
+            self._skip(number, f"it has only {len(line)} bytes")
+            return
         try:
             self._count(parse_line(line))
         except MessageError as error:
-            self.damaged += 1
-            if self.damaged > _TOLD:
-                return
-            LOG.warning("%s, line %d is not counted: %s", self._path, number, error)
+            self._skip(number, str(error))
+
+    def _skip(self, number: int, problem: str) -> None:
+        self.damaged += 1
+        if self.damaged <= _TOLD:
+            LOG.warning("%s, line %d is not counted: %s", self._path, number, problem)

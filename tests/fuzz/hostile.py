@@ -159,7 +159,7 @@ def _png(width: int, height: int) -> bytes:
 
     size = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
     rows = zlib.compressobj(9)
-    packed = b"".join(rows.compress(bytes(width + 1)) for _ in range(min(height, 20_000)))
+    packed = b"".join(rows.compress(bytes(width + 1)) for _ in range(height))
     data = part(b"IDAT", packed + rows.flush())
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", size) + data + part(b"IEND", b"")
 
@@ -326,9 +326,11 @@ def cases() -> Iterator[Case]:
         for name, make in _recordings():
             yield decoder, name, make
 
-    for decoder, begin in (("config", b""), ("joint maps", b""), ("set", b"a=")):
-        for name, make in _documents(begin):
-            yield decoder, name, make
+    for name, make in _documents():
+        yield "config", name, make
+    for decoder, begin in (("joint maps", b""), ("set", b"a=")):  # they are read as YAML too
+        yield decoder, "a billion values in nine lines", lambda b=begin: _laughs(b)
+        yield decoder, "1,000,000 lists inside each other", lambda b=begin: _filled(b, b"[")
     yield "set", "a key of 500,000 parts", lambda: b"a." * 500_000 + b"a=1"
     yield "set", "unknown keys by aliases", lambda: b"task=" + LAUGHS.replace(b"\n", b", ")
 
@@ -383,45 +385,45 @@ def _info(**given: object) -> bytes:
     return json.dumps(json.loads(valid[1:]) | given).encode()
 
 
-def _documents(begin: bytes) -> Iterator[tuple[str, Callable[[], bytes]]]:
-    """YAML; `begin` comes before it."""
-    yield (
-        "a billion values in nine lines",
-        lambda: begin + (LAUGHS if not begin else b"{" + LAUGHS.replace(b"\n", b", ") + b"}"),
-    )
-    yield "1,000 lists inside each other", lambda: begin + b"[" * 1000 + b"]" * 1000
-    yield "1,000,000 lists inside each other", lambda: _filled(begin, b"[")
-    yield "250 KiB of lists inside each other", lambda: begin + b"[" * 250_000
-    yield "1 MiB of empty keys", lambda: _filled(begin, b"? ")
-    yield "250 KiB of empty keys", lambda: begin + b"? " * 125_000
-    yield "250 KiB of dashes", lambda: begin + b"- " * 125_000
-    yield "250 KiB of values", lambda: begin + b"[" + b"a," * 125_000 + b"a]"
-    yield "a text of 250 KiB", lambda: begin + b"run: " + b"x" * 250_000
-    yield "a quoted text of 250 KiB", lambda: begin + b'"' + b"\\n" * 125_000 + b'"'
-    yield "a number of 250,000 digits", lambda: begin + b"9" * 250_000
-    yield "a hexadecimal number of 250,000 digits", lambda: begin + b"0x" + b"f" * 250_000
+def _laughs(begin: bytes) -> bytes:
+    return begin + (b"{" + LAUGHS.replace(b"\n", b", ") + b"}" if begin else LAUGHS)
+
+
+def _documents() -> Iterator[tuple[str, Callable[[], bytes]]]:
+    yield "a billion values in nine lines", lambda: LAUGHS
+    yield "1,000 lists inside each other", lambda: b"[" * 1000 + b"]" * 1000
+    yield "1,000,000 lists inside each other", lambda: _filled(b"", b"[")
+    yield "250 KiB of lists inside each other", lambda: b"[" * 250_000
+    yield "1 MiB of empty keys", lambda: _filled(b"", b"? ")
+    yield "250 KiB of empty keys", lambda: b"? " * 125_000
+    yield "250 KiB of dashes", lambda: b"- " * 125_000
+    yield "250 KiB of values", lambda: b"[" + b"a," * 125_000 + b"a]"
+    yield "a text of 250 KiB", lambda: b"run: " + b"x" * 250_000
+    yield "a quoted text of 250 KiB", lambda: b'"' + b"\\n" * 125_000 + b'"'
+    yield "a number of 250,000 digits", lambda: b"9" * 250_000
+    yield "a hexadecimal number of 250,000 digits", lambda: b"0x" + b"f" * 250_000
     yield (
         "a long text many times",
-        lambda: begin + b"[&a " + b"x" * 200_000 + b", *a" * 9_000 + b"]",
+        lambda: b"[&a " + b"x" * 200_000 + b", *a" * 9_000 + b"]",
     )
-    yield "a value inside itself", lambda: begin + b"&a [*a]"
+    yield "a value inside itself", lambda: b"&a [*a]"
     yield (
         "9,000 unknown keys",
-        lambda: begin + b"{" + b", ".join(b"k%d: 1" % n for n in range(4_900)) + b"}",
+        lambda: b"{" + b", ".join(b"k%d: 1" % n for n in range(4_900)) + b"}",
     )
-    yield "a comment of 1 MiB", lambda: _filled(begin, b"#")
+    yield "a comment of 1 MiB", lambda: _filled(b"", b"#")
 
 
 def _recordings() -> Iterator[tuple[str, Callable[[], bytes]]]:
     step = _topics("/step", "/joints", "/eye", "/tf", "/states")
     empty = _message(b"")
-    yield "a chunk of 2 GiB in 70 KB", lambda: _zeros_of(2)
+    yield "a chunk of 512 MiB in 17 KB", lambda: _zeros_of(0.5)
     yield "2^60 bytes told", lambda: _mcap(_chunk(b"", 2**60))
     yield "a million empty messages in one chunk", lambda: _mcap(_chunk(step + empty * 500_000))
     yield "empty messages in many chunks", lambda: _many_chunks(step + empty * 30_000)
     yield "chunks of 16 MB of zeros", lambda: _many_chunks(step + _message(bytes(16_000_000)))
     yield "chunks of 1 MB of zeros", lambda: _many_chunks(step + _message(bytes(1_000_000)))
-    yield "a picture of 4 GB in 4 MB", lambda: _picture(_png(30_000, 20_000)[:MIB])
+    yield "a picture of 60 million pixels", lambda: _picture(_png(30_000, 2_000))
     yield "a picture of 30,000 x 2 pixels", lambda: _picture(_png(30_000, 2))
     yield "a picture that is told to be 64 x 48 and is not whole", lambda: _picture(_png(64, 2))
     yield (
