@@ -82,9 +82,11 @@ class Attachment:
         return cls(sender, hashlib.sha256(payload).hexdigest())
 
     @classmethod
-    def read(cls, content: bytes) -> Self:
+    def read(cls, content: zenoh.ZBytes) -> Self:
         """Decode an attachment, or raise MessageError."""
-        return decode(Wire(schema_of(cls).encoding, content), cls)
+        encoding = schema_of(cls).encoding
+        check_size(len(content), encoding, cls)
+        return decode(Wire(encoding, content.to_bytes()), cls)
 
     def written(self) -> bytes:
         """Encode it."""
@@ -453,14 +455,15 @@ class Bus:
         """Decode what was received; the message, and its sender if the attachment names one."""
         key = str(received.key_expr)
         encoding = str(received.encoding)
-        name, sender = key, None
+        name, sender, attachment = key, None, None
         try:
+            if received.attachment is not None:
+                attachment = Attachment.read(received.attachment)
+                name, sender = f"{attachment.sender} ({key})", Sender.parse(attachment.sender)
             size = 0 if received.payload is None else len(received.payload)
             check_size(size, encoding, *classes, limit=limit)
             payload = b"" if received.payload is None else received.payload.to_bytes()
-            if received.attachment is not None:
-                attachment = Attachment.read(received.attachment.to_bytes())
-                name, sender = f"{attachment.sender} ({key})", Sender.parse(attachment.sender)
+            if attachment is not None:
                 attachment.check(payload)
             message = decode(Wire(encoding, payload), *classes, limit=limit)
             if problem := origin_problem(message, key, sender):
