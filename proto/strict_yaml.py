@@ -104,7 +104,7 @@ class _Loader(yaml.SafeLoader):
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         """Read a value with all that is in it; refuse it when the document becomes too large."""
         line = self.peek_event().start_mark.line + 1  # type: ignore[no-untyped-call]
-        is_alias = self.check_event(yaml.AliasEvent)  # type: ignore[no-untyped-call]
+        is_alias = self.check_event(yaml.AliasEvent)
         before = self._values
         self._values += 1
         self._depth += 1

@@ -221,7 +221,8 @@ def _is_as_written(record: McapRecord, content: bytes, frame: _Frame) -> bool:
     """Whether a record has no byte too many or too few."""
     builder = RecordBuilder()
     record.write(builder)
-    written, found = bytes(builder.end()), content[frame.begin - _FRAME.size : frame.end]
+    written = bytes(builder.end())  # type: ignore[no-untyped-call]
+    found = content[frame.begin - _FRAME.size : frame.end]
     if isinstance(record, Attachment) and found[-4:] == bytes(4):  # without a checksum
         return written[:-4] == found[:-4]
     return written == found

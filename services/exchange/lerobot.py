@@ -581,7 +581,9 @@ def _video_pictures(path: Path) -> Image:
             left -= frame.width * frame.height
             if left < 0:
                 raise ValueError(f"{path} has more pictures than a video of its size")
-            pictures.append(eye_picture(frame.to_ndarray(format="rgb24")))
+            pictures.append(
+                eye_picture(np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8))
+            )
     return np.stack(pictures)
 
 
