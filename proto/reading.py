@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Final
 
 from proto.errors import UserError
+
+_PIECE: Final = 2**20
 
 
 class TooLargeError(UserError):
@@ -24,8 +27,10 @@ def read_limited(path: Path, most: int) -> bytes:
     """
     with path.open("rb") as stream:
         size = path.stat().st_size
-        # One byte more than allowed, because some files, such as devices, do not tell their size.
-        content = b"" if size > most else stream.read(most + 1)
+        content = b"" if size > most else stream.read(size + 1)
+        # Some files, such as devices, do not tell their size; others grow meanwhile.
+        while size < len(content) <= most and (more := stream.read(_PIECE)):
+            content += more
     if size > most or len(content) > most:
         raise TooLargeError(f"{path} is larger than {most} bytes, which no such file is")
     return content
