@@ -26,7 +26,7 @@ from actors.tasks.registry import make_task
 from actors.view import focal_lengths, view_of
 from learner.checkpoint import Checkpoint
 from learner.network_policy import NetworkPolicy
-from learner.policy_message import policy_of
+from learner.policy_message import policy_limit, policy_of
 from proto.agreement import ANSWERING, Agreement
 from proto.bus import Bus
 from proto.codec import MessageError, Wire, encode
@@ -218,7 +218,12 @@ class Actor:
         self._agreement.check()
         outboxes = (self._sequences, self._rollouts)
         self._receipts.pass_on(self._bus.id, lambda: outboxes)
-        self._bus.subscribe_newest(keys.policy, self._on_policy, PolicyVersion)
+        self._bus.subscribe_newest(
+            keys.policy,
+            self._on_policy,
+            PolicyVersion,
+            limit=policy_limit(self._config.network),
+        )
         try:
             with (
                 membership(self._bus, self, self._lifecycle),

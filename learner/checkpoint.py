@@ -28,6 +28,7 @@ from proto.errors import UserError
 from proto.messages import LARGEST_VERSION
 from proto.metrics import Stage
 from proto.plain_text import plain, plain_lines
+from proto.reading import read_limited
 from proto.storage import written_whole
 
 Tensors = Mapping[str, NDArray[np.generic]]
@@ -40,6 +41,13 @@ _LARGEST_WEIGHT: Final = 1e6
 """With weights of at most this magnitude no sum in the network leaves float32."""
 _WIDEST_CODE: Final = 1e4
 """Largest magnitude of an end of the range of an action value (degrees, or levels)."""
+_LARGEST_HEADER: Final = 8 * 2**20
+"""Size of the names, shapes and metadata in a file (bytes)."""
+_MOST_VALUES: Final = 2000
+"""Values in the metadata, the ids of sequences not counted."""
+_MOST_SEQUENCES: Final = 100_000
+LARGEST_FILE: Final = 2 * 2**30
+"""Size of a file: the weights of the largest network, with what training keeps for each."""
 _BROKEN: Final = (
     SafetensorError,
     ValueError,  # also what pydantic and json raise
@@ -199,9 +207,14 @@ def checkpoint_from_bytes(blob: bytes, origin: str) -> Checkpoint:
     Raises:
         UserError: they are damaged, foreign, or their tensors do not fit their own metadata.
     """
+    header_size = int.from_bytes(blob[:8], "little")
+    if header_size > _LARGEST_HEADER:
+        raise UserError(
+            f"{origin} is not a checkpoint, or is damaged (its header is said to have"
+            f" {header_size} bytes); take another one"
+        )
     try:
         tensors = load_tensors(blob)
-        header_size = int.from_bytes(blob[:8], "little")
         notes = json.loads(blob[8 : 8 + header_size]).get("__metadata__") or {}
         text = notes.get(_METADATA_KEY)
     except (*_BROKEN, KeyError) as error:
@@ -235,7 +248,7 @@ def load_checkpoint(path: str | Path) -> Checkpoint:
         UserError: the file is missing, damaged or foreign.
     """
     try:
-        blob = checkpoint_path(path).read_bytes()
+        blob = read_limited(checkpoint_path(path), LARGEST_FILE)
     except OSError as error:
         raise UserError(f"checkpoint {path} cannot be read: {error.strerror}") from error
     return checkpoint_from_bytes(blob, f"checkpoint {path}")
@@ -275,6 +288,7 @@ def _fields(network: NetworkConfig) -> dict[str, object]:
 def _metadata(text: str, origin: str) -> CheckpointMetadata:
     try:
         values = json.loads(text)
+        _check_size(values)
         if isinstance(values, dict) and values.get("format", 1) == 1:
             _convert_format_1(values, origin)
         return CheckpointMetadata.model_validate(values)
@@ -285,12 +299,36 @@ def _metadata(text: str, origin: str) -> CheckpointMetadata:
         ) from error
 
 
+def _check_size(values: Any) -> None:
+    """Refuse metadata that are too large, before each value that does not fit becomes an error.
+
+    Raises:
+        ValueError: they are too large.
+    """
+    left, todo = _MOST_VALUES, [values]
+    training = values.get("training") if isinstance(values, dict) else None
+    ids = training.get("sequences") if isinstance(training, dict) else None
+    if isinstance(ids, list):
+        if len(ids) > _MOST_SEQUENCES or not all(isinstance(each, str) for each in ids):
+            raise ValueError(f"training.sequences are not at most {_MOST_SEQUENCES} ids")
+        left += len(ids)
+    while todo:
+        value = todo.pop()
+        items = list(value.values()) if isinstance(value, dict) else value
+        if isinstance(items, list):
+            left -= len(items)
+            todo += items if items is not ids else []
+        if left < 0:
+            raise ValueError(f"they have more than {_MOST_VALUES} values")
+
+
 def _convert_format_1(values: dict[str, Any], origin: str) -> None:
     """Drop the image size, which format 1 may name, and give each question its window."""
     size = values.get("network", {}).pop("image", [IMAGE_WIDTH, IMAGE_HEIGHT])
     if size != [IMAGE_WIDTH, IMAGE_HEIGHT]:
         raise UserError(
-            f"{origin} is of a network for images of the size {size} (width, height), but the"
+            f"{origin} is of a network for images of the size {plain(size, 100)} (width, height),"
+            " but the"
             f" robot's images are {IMAGE_WIDTH} x {IMAGE_HEIGHT}; take another checkpoint"
         )
     training = values.get("training")

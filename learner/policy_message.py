@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+import math
+from typing import Final
+
 from learner.checkpoint import (
     Checkpoint,
     CheckpointMetadata,
     check_same_network,
     checkpoint_from_bytes,
 )
-from proto.config import Config
+from learner.network.subnets import parameter_shapes
+from proto.config import Config, NetworkConfig
 from proto.errors import UserError
 from proto.messages import LARGEST_LOSS, PolicyVersion
 from proto.plain_text import plain
 
-_ORIGIN = "the policy"
+_ORIGIN: Final = "the policy"
+_REST: Final = 256 * 1024
+"""Room for all in a message but the weights; the metadata take a few KiB."""
+
+
+def policy_limit(network: NetworkConfig) -> int:
+    """Largest size of a message with a policy of a network (bytes).
+
+    Raises:
+        UserError: there can be no such network.
+    """
+    weights = sum(math.prod(shape) for shape in parameter_shapes(network).values())
+    return 4 * weights + _REST
 
 
 def policy_message(run_id: str, metadata: CheckpointMetadata, weights: bytes) -> PolicyVersion:

@@ -25,7 +25,17 @@ from typing import Annotated, Any, Final, Generic, Self, TypeVar
 import zenoh
 import zenoh.ext
 
-from proto.codec import MessageError, Text, Wire, decode, encode, message, schema_of
+from proto.codec import (
+    MEBIBYTE,
+    MessageError,
+    Text,
+    Wire,
+    check_size,
+    decode,
+    encode,
+    message,
+    schema_of,
+)
 from proto.config import HubConfig
 from proto.errors import UserError
 from proto.keys import Keys, Role
@@ -46,6 +56,8 @@ LOG = logging.getLogger(__name__)
 
 CONNECT_WAIT_S: Final = 5.0
 """How long one try to connect to the hub lasts."""
+LARGEST_MESSAGE: Final = 132 * MEBIBYTE
+"""No session takes a larger message; larger than `proto.messages.POLICY_LIMIT`."""
 SHARED_MEMORY_FROM_BYTES: Final = 64 * 1024
 _CONNECT_AGAIN_S: Final = 1.0
 _SENDERS_REMEMBERED: Final = 1000
@@ -85,9 +97,11 @@ class Attachment:
         return cls(sender, hashlib.sha256(payload).hexdigest())
 
     @classmethod
-    def read(cls, content: bytes) -> Self:
+    def read(cls, content: zenoh.ZBytes) -> Self:
         """Decode an attachment, or raise MessageError."""
-        return decode(Wire(schema_of(cls).encoding, content), cls)
+        encoding = schema_of(cls).encoding
+        check_size(len(content), encoding, cls)
+        return decode(Wire(encoding, content.to_bytes()), cls)
 
     def written(self) -> bytes:
         """Encode it."""
@@ -318,13 +332,26 @@ class Bus:
 
         self._declared.append(self._session.declare_subscriber(key, self._guarded(receive)))
 
-    def subscribe_newest(self, key: str, callback: Callable[[M], None], *classes: type[M]) -> None:
-        """Subscribe to `publish_newest`: the newest earlier message is received first."""
+    def subscribe_newest(
+        self,
+        key: str,
+        callback: Callable[[M], None],
+        *classes: type[M],
+        limit: int | None = None,
+    ) -> None:
+        """Subscribe to `publish_newest`: the newest earlier message is received first.
+
+        Args:
+            key: where.
+            callback: called with each message.
+            classes: classes of the messages.
+            limit: largest size of a message that is decoded here (bytes).
+        """
         self._declared.append(
             zenoh.ext.declare_advanced_subscriber(
                 self._session,
                 key,
-                self._receiver(callback, classes),
+                self._receiver(callback, classes, limit),
                 history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
                 recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
             )
@@ -444,18 +471,25 @@ class Bus:
         )
 
     def _decode(
-        self, received: zenoh.Sample | zenoh.Query, *classes: type[M]
+        self,
+        received: zenoh.Sample | zenoh.Query,
+        *classes: type[M],
+        limit: int | None = None,
     ) -> tuple[M, Sender | None]:
         """Decode what was received; the message, and its sender if the attachment names one."""
         key = str(received.key_expr)
-        name, sender = key, None
-        payload = b"" if received.payload is None else received.payload.to_bytes()
+        encoding = str(received.encoding)
+        name, sender, attachment = key, None, None
         try:
             if received.attachment is not None:
-                attachment = Attachment.read(received.attachment.to_bytes())
+                attachment = Attachment.read(received.attachment)
                 name, sender = f"{attachment.sender} ({key})", Sender.parse(attachment.sender)
+            size = 0 if received.payload is None else len(received.payload)
+            check_size(size, encoding, *classes, limit=limit)
+            payload = b"" if received.payload is None else received.payload.to_bytes()
+            if attachment is not None:
                 attachment.check(payload)
-            message = decode(Wire(str(received.encoding), payload), *classes)
+            message = decode(Wire(encoding, payload), *classes, limit=limit)
             if problem := origin_problem(message, key, sender):
                 raise MessageError("sender", problem)
         except MessageError as error:
@@ -476,9 +510,14 @@ class Bus:
         return Attachment.of(wire.payload, f"{self.role}/{self.id}").written()
 
     def _receiver(
-        self, callback: Callable[[M], None], classes: tuple[type[M], ...]
+        self,
+        callback: Callable[[M], None],
+        classes: tuple[type[M], ...],
+        limit: int | None = None,
     ) -> Callable[[zenoh.Sample], None]:
-        return self._guarded(lambda sample: callback(self.decode(sample, *classes)))
+        return self._guarded(
+            lambda sample: callback(self._decode(sample, *classes, limit=limit)[0])
+        )
 
     def _guarded(self, receive: Callable[[zenoh.Sample], None]) -> Callable[[zenoh.Sample], None]:
         """Call `receive`, and let no exception out into Zenoh's thread."""
@@ -597,7 +636,11 @@ def _settings(config: HubConfig, mode: str, certificate: Certificate | None) -> 
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "timestamping": {"enabled": True},  # the newest sample of a key is kept by its timestamp
         "transport": {
-            "link": link_settings(certificate, listens=mode == "router"),
+            # A session that receives more closes the link, before it has taken the memory.
+            "link": {
+                "rx": {"max_message_size": LARGEST_MESSAGE},
+                **link_settings(certificate, listens=mode == "router"),
+            },
             "shared_memory": {
                 "enabled": config.shared_memory,
                 "transport_optimization": {"message_size_threshold": SHARED_MEMORY_FROM_BYTES},

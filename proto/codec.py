@@ -36,6 +36,8 @@ Sizes = dict[str, int]
 """Named sizes found so far in a message, such as its number of steps T."""
 
 MEBIBYTE: Final = 1 << 20
+_LONGEST_FIELD: Final = 300
+_LONGEST_PROBLEM: Final = 1000
 
 
 class MessageError(Exception):
@@ -47,9 +49,9 @@ class MessageError(Exception):
     """
 
     def __init__(self, field: str, problem: str) -> None:
-        super().__init__(f"{field}: {problem}")
-        self.field = field
-        self.problem = problem
+        self.field = field[:_LONGEST_FIELD]
+        self.problem = problem[:_LONGEST_PROBLEM]
+        super().__init__(f"{self.field}: {self.problem}")
 
 
 class Check(Protocol):
@@ -70,9 +72,21 @@ class Check(Protocol):
             MessageError: the plain form is not valid for this field.
         """
 
+    @property
+    def most_values(self) -> int:
+        """Largest number of lists, maps and their items in a valid plain form, itself included."""
+
+
+class _Single:
+    """A check of a form that holds nothing else."""
+
+    @property
+    def most_values(self) -> int:
+        return 1
+
 
 @dataclass(frozen=True)
-class Integer:
+class Integer(_Single):
     """An integer in least..most."""
 
     least: int = -(2**63)
@@ -90,7 +104,7 @@ class Integer:
 
 
 @dataclass(frozen=True)
-class Number:
+class Number(_Single):
     """A finite number in least..most."""
 
     least: float = -1e12
@@ -108,7 +122,7 @@ class Number:
 
 
 @dataclass(frozen=True)
-class Flag:
+class Flag(_Single):
     """True or false."""
 
     def pack(self, value: bool) -> Plain:
@@ -121,7 +135,7 @@ class Flag:
 
 
 @dataclass(frozen=True)
-class Text:
+class Text(_Single):
     """Printable text of at most `longest` characters that matches `pattern` as a whole."""
 
     longest: int = 256
@@ -145,7 +159,7 @@ class Text:
 
 
 @dataclass(frozen=True)
-class NumberOrText:
+class NumberOrText(_Single):
     """A finite number or a text; a number stays a number, a text stays a text."""
 
     number: Number = Number()
@@ -160,7 +174,7 @@ class NumberOrText:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Choice(_Single):
     """One member of an enumeration of strings, by its value."""
 
     members: type[Enum]
@@ -178,7 +192,7 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class Blob:
+class Blob(_Single):
     """Between one and `most` bytes."""
 
     most: int
@@ -237,6 +251,10 @@ class Array:
     def _little_endian(self) -> np.dtype[Any]:
         return self._native.newbyteorder("<")
 
+    @property
+    def most_values(self) -> int:
+        return 4 + len(self.shape)
+
     def pack(self, value: NDArray[Any]) -> Plain:
         array = np.asarray(value)
         # `dtype.name` is slow: it would take longer than the rest of this function.
@@ -249,7 +267,7 @@ class Array:
             raise MessageError(where, f"expected [dtype, shape, bytes], got {_kind(plain)}")
         dtype, shape, content = plain
         if dtype != self.dtype:
-            raise MessageError(where, f"expected dtype {self.dtype}, got {dtype!a:.64}")
+            raise MessageError(where, f"expected dtype {self.dtype}, got {_shown(dtype)}")
         self._check_shape(shape, where, sizes)
         if not isinstance(content, bytes):
             raise MessageError(where, f"expected bytes as content, got {_kind(content)}")
@@ -264,7 +282,7 @@ class Array:
     def _check_shape(self, shape: Plain, where: str, sizes: Sizes) -> None:
         whole = isinstance(shape, list) and all(type(size) is int for size in shape)
         if not whole or len(shape) != len(self.shape):
-            raise MessageError(where, f"expected shape {self._shape_text()}, got {shape!a:.64}")
+            raise MessageError(where, f"expected shape {self._shape_text()}, got {_shown(shape)}")
         for expected, got in zip(self.shape, shape, strict=True):
             if isinstance(expected, Size):
                 expected.check(got, where, sizes)
@@ -293,6 +311,10 @@ class Maybe:
 
     item: Check
 
+    @property
+    def most_values(self) -> int:
+        return self.item.most_values
+
     def pack(self, value: Any) -> Plain:
         return None if value is None else self.item.pack(value)
 
@@ -315,6 +337,10 @@ class Many:
     item: Check
     size: Size
 
+    @property
+    def most_values(self) -> int:
+        return 1 + self.size.most * self.item.most_values
+
     def pack(self, value: Sequence[Any]) -> Plain:
         return [self.item.pack(item) for item in value]
 
@@ -334,6 +360,10 @@ class Table:
     item: Check
     most: int
 
+    @property
+    def most_values(self) -> int:
+        return 1 + self.most * self.item.most_values
+
     def pack(self, value: Mapping[str, Any]) -> Plain:
         return {str(key): self.item.pack(item) for key, item in value.items()}
 
@@ -345,7 +375,7 @@ class Table:
         name = Text(64)
         return {
             name.unpack(key, f"{where} (a key)", sizes): self.item.unpack(
-                item, f"{where}[{key!a:.66}]", sizes
+                item, f"{where}[{_shown(key)}]", sizes
             )
             for key, item in plain.items()
         }
@@ -361,6 +391,10 @@ class Record:
     record_class: type[Any]
     fields: Mapping[str, Check]
 
+    @property
+    def most_values(self) -> int:
+        return 1 + sum(check.most_values for check in self.fields.values())
+
     def pack(self, value: Any) -> Plain:
         return {
             name: check.pack(getattr(value, name))
@@ -373,7 +407,7 @@ class Record:
             raise MessageError(where or "payload", f"expected a map of fields, got {_kind(plain)}")
         for name in plain:
             if name not in self.fields:
-                raise MessageError(_path(where, f"{name!a:.64}"), "is not a field of this message")
+                raise MessageError(_path(where, _shown(name)), "is not a field of this message")
         values = {}
         for name, check in self.fields.items():
             if name not in plain and not isinstance(check, Added):
@@ -402,6 +436,11 @@ class Schema:
     form: Literal["msgpack", "json"]
     limit: int
     record: Record
+
+    @cached_property
+    def most_values(self) -> int:
+        """Largest number of lists, maps and their items in a valid payload."""
+        return self.record.most_values
 
     @property
     def encoding(self) -> str:
@@ -469,46 +508,99 @@ def encode(value: Any, *, check: bool = True) -> Wire:
         payload = json.dumps(plain, allow_nan=False).encode()
     else:
         payload = msgpack.packb(plain)
-    _check_length(payload, schema)
+    check_size(len(payload), schema.encoding, type(value))
     return Wire(schema.encoding, payload)
 
 
-def decode(wire: Wire, *classes: type[Message]) -> Message:
+def decode(wire: Wire, *classes: type[Message], limit: int | None = None) -> Message:
     """Decode a message of one of `classes`; the encoding selects the class.
+
+    Args:
+        wire: the encoded message.
+        classes: classes that it may have.
+        limit: largest size of a payload here, where it is less than that of the class (bytes).
 
     Raises:
         MessageError: it is a message of another class or version, or a field is not valid.
     """
+    schema = _schema_by(wire.encoding, classes)
+    check_size(len(wire.payload), wire.encoding, *classes, limit=limit)
+    read = _read_json if schema.form == "json" else _read_msgpack
+    value: Message = schema.record.unpack(read(wire.payload, schema.most_values), "", {})
+    return value
+
+
+def check_size(size: int, encoding: str, *classes: type[Any], limit: int | None = None) -> None:
+    """Refuse a payload that is too large, before it is copied; arguments as in `decode`.
+
+    Raises:
+        MessageError: it is too large, or of none of `classes`.
+    """
+    schema = _schema_by(encoding, classes)
+    most = schema.limit if limit is None else min(limit, schema.limit)
+    if size > most:
+        raise MessageError("payload", f"expected at most {most} bytes, got {size}")
+
+
+def _schema_by(encoding: str, classes: Sequence[type[Any]]) -> Schema:
     schemas = [_SCHEMAS[message_class] for message_class in classes]
-    schema = next((schema for schema in schemas if schema.encoding == wire.encoding), None)
+    schema = next((schema for schema in schemas if schema.encoding == encoding), None)
     if schema is None:
         expected = " or ".join(schema.encoding for schema in schemas)
         raise MessageError(
             "encoding",
-            f"expected {expected}, got {wire.encoding[:128]!a}: do both ends run the same "
+            f"expected {expected}, got {encoding[:128]!a}: do both ends run the same "
             "version of vmdnn?",
         )
-    _check_length(wire.payload, schema)
-    read = _read_json if schema.form == "json" else _read_msgpack
-    value: Message = schema.record.unpack(read(wire.payload), "", {})
-    return value
+    return schema
 
 
-def _check_length(payload: bytes, schema: Schema) -> None:
-    if len(payload) > schema.limit:
-        raise MessageError("payload", f"expected at most {schema.limit} bytes, got {len(payload)}")
+class _Budget:
+    """Counts lists, maps and their items while a payload is decoded.
+
+    A byte of msgpack can be a map, which takes 64 bytes of memory.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._left = most
+
+    def take(self, count: int) -> None:
+        """Count some; ValueError if there are too many."""
+        self._left -= count
+        if self._left < 0:
+            raise ValueError(f"it has more than {self._most} values")
+
+    def list_hook(self, items: list[Any]) -> list[Any]:
+        """Count a list."""
+        self.take(1 + len(items))
+        return items
+
+    def map_hook(self, items: list[tuple[Any, Any]]) -> dict[Any, Any]:
+        """Count a map."""
+        self.take(1 + len(items))
+        return dict(items)
 
 
-def _read_msgpack(payload: bytes) -> Plain:
+def _read_msgpack(payload: bytes, most_values: int) -> Plain:
+    budget = _Budget(2 * most_values)  # an item that is a list or a map counts twice
     try:
-        return msgpack.unpackb(payload)
-    except (ValueError, msgpack.UnpackException) as error:
+        return msgpack.unpackb(
+            payload,
+            list_hook=budget.list_hook,
+            object_pairs_hook=budget.map_hook,
+            max_array_len=most_values,
+            max_map_len=most_values,
+            max_ext_len=0,
+        )
+    except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
         raise MessageError("payload", f"is not msgpack: {str(error)[:128]}") from error
 
 
-def _read_json(payload: bytes) -> Plain:
+def _read_json(payload: bytes, most_values: int) -> Plain:
+    budget = _Budget(2 * most_values)
     try:
-        return json.loads(payload)
+        return json.loads(payload, object_pairs_hook=budget.map_hook)
     except (ValueError, RecursionError) as error:
         raise MessageError("payload", f"is not JSON: {str(error)[:128]}") from error
 
@@ -552,6 +644,13 @@ def _check_of(hint: Any, where: str) -> Check:
 
 def _path(where: str, name: str) -> str:
     return f"{where}.{name}" if where else name
+
+
+def _shown(plain: Plain) -> str:
+    """A value from outside, for an error: the beginning of a text, or the kind of what it is."""
+    if isinstance(plain, str | bytes):
+        return ascii(plain[:64])
+    return str(plain) if isinstance(plain, int) and abs(plain) < 2**64 else _kind(plain)
 
 
 def _kind(plain: Plain) -> str:

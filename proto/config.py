@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import reprlib
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -25,9 +26,19 @@ from pydantic_core import ErrorDetails
 from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.disturbances import DISTURBANCES
 from proto.errors import UserError
+from proto.plain_text import plain, plain_lines
+from proto.reading import read_limited
 from proto.seeds import PRACTICE, SEEDS_PER_CASE, TRIALS_BELOW
 from proto.storage import written_whole
-from proto.strict_yaml import WrittenFloat, WrittenInt, dump_yaml, load_yaml
+from proto.strict_yaml import (
+    DEEPEST,
+    LONGEST,
+    MOST_VALUES,
+    WrittenFloat,
+    WrittenInt,
+    dump_yaml,
+    load_yaml,
+)
 from proto.suites import (
     BUILT_IN,
     MOST_STRETCH,
@@ -105,6 +116,10 @@ class _Section(BaseModel):
 
 LOG = logging.getLogger(__name__)
 
+_PROBLEMS_TOLD: Final = 20
+_LONGEST_PROBLEM: Final = 1000
+_REPR: Final = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = 100
 _RETIRED_KEYS: Final = (
     "network.image",
     "learner.pretraining.labels",
@@ -778,22 +793,29 @@ def load_config(path: Path | None, overrides: Sequence[str] = ()) -> Config:
 def _checked(values: dict[str, Any], overrides: Sequence[str], where: str) -> Config:
     for override in overrides:
         _apply(values, override)
+    if _count_values(values) > MOST_VALUES:
+        raise UserError(f"the config has more than {MOST_VALUES} values; no config needs so many")
     try:
         return Config.model_validate(values)
     except ValidationError as error:
-        problems = "\n".join(
-            f"  {_key_of(problem)}: {_what_is_wrong(problem)}" for problem in error.errors()
+        found = error.errors(include_url=False)
+        problems = "".join(
+            f"\n  {plain(_key_of(problem), 200)}: {plain(_what_is_wrong(problem), 500)}"
+            for problem in found[:_PROBLEMS_TOLD]
         )
-        raise UserError(f"{where} is not valid:\n{problems}") from error
+        more = f"\n  and {len(found) - _PROBLEMS_TOLD} more" if len(found) > _PROBLEMS_TOLD else ""
+        raise UserError(f"{where} is not valid:{problems}{more}") from error
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        values = load_yaml(path.read_text())
+        values = load_yaml(read_limited(path, LONGEST).decode())
     except FileNotFoundError as error:
         raise UserError(f"config file {path} does not exist") from error
     except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"config file {path} cannot be read: {error}") from error
+        raise UserError(
+            f"config file {path} cannot be read: {plain_lines(error)[:_LONGEST_PROBLEM]}"
+        ) from error
     if values is None:
         return {}
     if not isinstance(values, dict):
@@ -822,7 +844,22 @@ def _what_is_wrong(problem: ErrorDetails) -> str:
         similar = get_close_matches(_key_of(problem), _keys_of(Config), n=1)
         advice = f"did you mean {similar[0]}?" if similar else "proto/config.py lists all keys"
         return f"there is no such key; {advice}"
-    return f"{problem['msg'].removeprefix('Value error, ')} (got {problem['input']!r})"
+    what = plain(problem["msg"].removeprefix("Value error, "), 300)
+    return f"{what} (got {_shown(problem['input'])})"
+
+
+def _shown(value: Any) -> str:
+    """A value from outside, cut off where it is long."""
+    return plain(_REPR.repr(value), 100)
+
+
+def _count_values(value: Any) -> int:
+    """Number of values in a value from YAML, itself included."""
+    if isinstance(value, dict):
+        return 1 + sum(map(_count_values, value.values()))
+    if isinstance(value, list):
+        return 1 + sum(map(_count_values, value))
+    return 1
 
 
 def _keys_of(section: type[BaseModel], prefix: str = "") -> list[str]:
@@ -838,16 +875,22 @@ def _keys_of(section: type[BaseModel], prefix: str = "") -> list[str]:
 
 def _apply(values: dict[str, Any], override: str) -> None:
     key, separator, text = override.partition("=")
+    where = f"--set {plain(repr(override), 200)}"
     if not separator or not key:
-        raise UserError(f"--set {override!r}: expected key=value, such as learner.rate=1e-3")
+        raise UserError(f"{where}: expected key=value, such as learner.rate=1e-3")
     *sections, last = key.split(".")
+    if len(sections) > DEEPEST:
+        raise UserError(f"{where}: no key has more than {DEEPEST} parts")
     for section in sections:
         if values.get(section) is None:
             values[section] = {}
         if not isinstance(values[section], dict):
-            raise UserError(f"--set {override!r}: {section} is a value, not a section")
+            raise UserError(f"{where}: {plain(section, 100)} is a value, not a section")
         values = values[section]
     try:
         values[last] = load_yaml(text)
     except yaml.YAMLError as error:
-        raise UserError(f"--set {override!r}: {text!r} is not a YAML value: {error}") from error
+        problem = plain_lines(error)[:_LONGEST_PROBLEM]
+        raise UserError(
+            f"{where}: {plain(repr(text), 200)} is not a YAML value: {problem}"
+        ) from error

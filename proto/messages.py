@@ -41,7 +41,8 @@ from proto.suites import Player, suite_of
 from proto.variables import SituationField
 
 EPISODE_LIMIT: Final = 32 * MEBIBYTE
-POLICY_LIMIT: Final = 256 * MEBIBYTE
+POLICY_LIMIT: Final = 130 * MEBIBYTE
+"""Size of the largest possible network; in a run its own network sets the limit (bytes)."""
 
 Count = Annotated[int, Integer(0, 2**31)]
 LARGEST_VERSION: Final = 10**6

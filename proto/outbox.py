@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
+import re
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
@@ -15,6 +17,8 @@ from typing import Final
 from proto.codec import Wire
 from proto.errors import UserError
 from proto.keys import Role
+from proto.plain_text import plain
+from proto.reading import read_limited
 from proto.storage import (
     StorageError,
     change_suffix,
@@ -34,6 +38,12 @@ IN_FLIGHT: Final = 8
 
 PREPARED: Final = ".prepared"
 """File suffix of messages that are sent if this process dies."""
+_LARGEST_FILE: Final = 34 * 2**20
+"""Size of a file; an episode, the largest message here, has at most 32 MiB."""
+_LARGEST_HEADER: Final = 4096
+_DAMAGE: Final = (UserError, ValueError, KeyError, TypeError, AttributeError, RecursionError)
+"""What reading a damaged file raises."""
+
 PUT_ASIDE: Final = (".refused", ".damaged")
 """File suffixes of messages that are kept but not sent any more."""
 
@@ -67,8 +77,9 @@ class Outbox:
     Messages that were sent least often go first, the oldest of them first: messages that nobody
     answers, such as those of another version, do not hold up the others.
 
-    A file is one line of JSON with key, encoding and receivers, followed by the payload. Used by
-    several threads.
+    A file is one line of JSON with key, encoding, receivers and the digest of the payload, followed
+    by the payload. A damaged file is kept with the suffix `.damaged` and not sent. Used by several
+    threads.
 
     A message can also be prepared for the case that this process dies: the next process that
     opens the folder sends it.
@@ -198,7 +209,12 @@ class Outbox:
         self, name: str, suffix: str, key: str, wire: Wire, receivers: Collection[Role]
     ) -> Path:
         path = self._folder / f"{time.time_ns()}-{name}{suffix}"
-        values = {"key": key, "encoding": wire.encoding, "receivers": sorted(receivers)}
+        values = {
+            "key": key,
+            "encoding": wire.encoding,
+            "receivers": sorted(receivers),
+            "sha256": hashlib.sha256(wire.payload).hexdigest(),
+        }
         with written_whole(path) as stream:
             stream.write(json.dumps(values).encode() + b"\n" + wire.payload)
         return path
@@ -237,17 +253,17 @@ class Outbox:
 
     def _send_one(self, name: str, entry: _Entry) -> None:
         try:
-            header, _, payload = entry.path.read_bytes().partition(b"\n")
-            values = json.loads(header)
+            key, receivers, wire = _read_message(entry.path)
             if entry.sends == 1:  # it may be a former process's
-                entry.missing = {Role(role) for role in values.get("receivers", ())}
-            self._send(values["key"], Wire(values["encoding"], payload))
+                entry.missing = receivers
+            self._send(key, wire)
         except FileNotFoundError:
             pass  # its answer came in between
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except _DAMAGE as error:
             with self._lock:
                 self._entries.pop(name, None)
-            self._set_aside(entry.path, ".damaged", f"is damaged ({error})")
+            problem = plain(error, 300) or type(error).__name__
+            self._set_aside(entry.path, ".damaged", f"is damaged ({problem})")
 
     def _set_aside(self, path: Path, suffix: str, problem: str) -> None:
         try:
@@ -262,3 +278,36 @@ class Outbox:
 
 def _name_of(path: Path) -> str:
     return path.stem.partition("-")[2]
+
+
+def message_problem(path: Path) -> str:
+    """Return why a file of an outbox is damaged; empty if it is not, or is gone."""
+    try:
+        _read_message(path)
+    except FileNotFoundError:
+        return ""
+    except _DAMAGE as error:
+        return f"it is damaged ({plain(error, 300) or type(error).__name__})"
+    return ""
+
+
+def _read_message(path: Path) -> tuple[str, set[Role], Wire]:
+    """Key, receivers and message of a file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        one of _DAMAGE: it is damaged.
+    """
+    header, _, payload = read_limited(path, _LARGEST_FILE).partition(b"\n")
+    if len(header) > _LARGEST_HEADER:
+        raise ValueError("its first line is too long")
+    values = json.loads(header)
+    key, encoding, receivers = values["key"], values["encoding"], values.get("receivers", [])
+    if not (isinstance(key, str) and isinstance(encoding, str) and isinstance(receivers, list)):
+        raise ValueError("its first line does not say where it goes")
+    if re.fullmatch(r"[\w.-]+(?:/[\w.-]+)*", key) is None:
+        raise ValueError(f"{key!r} is not a key")
+    digest = hashlib.sha256(payload).hexdigest()
+    if values.get("sha256", digest) != digest:  # older files have no digest
+        raise ValueError("its content differs from its digest")
+    return key, {Role(role) for role in receivers}, Wire(encoding, payload)

@@ -22,7 +22,10 @@ def plain(text: object, longest: int = LONGEST) -> str:
         text: the text, or an object such as an exception whose text is meant.
         longest: number of characters to keep; `...` stands for the rest.
     """
-    whole = str(text)
+    try:
+        whole = str(text)
+    except ValueError:  # an integer of more than 4,300 digits
+        whole = f"a {type(text).__name__}"
     kept = whole if len(whole) <= longest else f"{whole[:longest]}..."
     if kept.isprintable():
         return kept

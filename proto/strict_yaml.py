@@ -2,6 +2,9 @@
 
 PyYAML implements YAML 1.1, in which `no` is false, `010` is eight and `12:30:45` is a number. Here
 they are the text `no`, the number ten and the text `12:30:45`; `1e-3` is a number.
+
+A document is limited in length, depth and number of values before anything is made of it. Aliases
+count as what they stand for: nine lines of them can stand for millions of values.
 """
 
 from __future__ import annotations
@@ -11,12 +14,31 @@ from typing import Any, Final
 
 import yaml
 
+from proto.plain_text import plain
+
 _PREFIX: Final = "tag:yaml.org,2002:"
 _INTEGER: Final = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
 _FLOAT: Final = re.compile(
     r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
 )
+LONGEST: Final = 256 * 1024
+"""Characters of a document."""
+MOST_VALUES: Final = 10_000
+"""Values in a document: texts, numbers, lists and sections, keys included."""
+DEEPEST: Final = 50
+"""Sections and lists inside each other."""
+_LONGEST_NUMBER: Final = 100
+_BROKEN: Final = (
+    ValueError,
+    TypeError,
+    AttributeError,
+    LookupError,
+    ArithmeticError,
+    RecursionError,
+)
+"""What PyYAML raises, besides its own errors, for values with tags such as `!!timestamp`."""
+
 _RESOLVERS: Final = {
     "null": re.compile(r"~|null|Null|NULL|"),
     "bool": re.compile(r"true|True|TRUE|false|False|FALSE"),
@@ -41,12 +63,15 @@ def load_yaml(text: str) -> Any:
     """Read one YAML document; numbers are `WrittenInt` and `WrittenFloat`.
 
     Raises:
-        yaml.YAMLError: it is not YAML, or a key stands twice in a map; the message has the lines.
+        yaml.YAMLError: it is not YAML, a key stands twice in a map, or it is too large; the message
+            has the lines.
     """
+    if len(text) > LONGEST:
+        raise yaml.YAMLError(f"it is longer than {LONGEST} characters")
     try:
         return yaml.load(text, _Loader)
-    except RecursionError as error:
-        raise yaml.YAMLError("it is nested too deeply") from error
+    except _BROKEN as error:
+        raise yaml.YAMLError(f"a value is not valid: {plain(error, 200)}") from error
 
 
 def dump_yaml(value: Any) -> str:
@@ -70,6 +95,32 @@ _Dumper.add_representer(str, _represent_text)
 class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
 
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._values = 0
+        self._depth = 0
+        self._sizes: dict[int, int] = {}
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Read a value with all that is in it; refuse it when the document becomes too large."""
+        line = self.peek_event().start_mark.line + 1  # type: ignore[no-untyped-call]
+        is_alias = self.check_event(yaml.AliasEvent)
+        before = self._values
+        self._values += 1
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise yaml.YAMLError(f"line {line}: it is nested deeper than {DEEPEST}")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if is_alias:
+            if id(node) not in self._sizes:
+                raise yaml.YAMLError(f"line {line}: a value contains itself")
+            self._values += self._sizes[id(node)]
+        if self._values > MOST_VALUES:
+            raise yaml.YAMLError(f"line {line}: it has more than {MOST_VALUES} values")
+        self._sizes.setdefault(id(node), self._values - before)
+        return node
+
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Make a dict; refuse a key that stands twice."""
         first_lines: dict[Any, int] = {}
@@ -80,8 +131,8 @@ class _Loader(yaml.SafeLoader):
                 raise yaml.YAMLError(f"line {line}: a key must be a name")
             if key in first_lines:
                 raise yaml.YAMLError(
-                    f"the key {key!r} stands twice in the same section, in line {first_lines[key]} "
-                    f"and in line {line}: remove one of them"
+                    f"the key {plain(repr(key), 100)} stands twice in the same section, in line "
+                    f"{first_lines[key]} and in line {line}: remove one of them"
                 )
             first_lines[key] = line
         mapping: dict[Any, Any] = super().construct_mapping(node, deep)
@@ -90,8 +141,8 @@ class _Loader(yaml.SafeLoader):
 
 def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
     text = str(loader.construct_scalar(node))
-    if _INTEGER.fullmatch(text) is None:
-        raise yaml.YAMLError(f"line {node.start_mark.line + 1}: {text!r} is not an integer")
+    if len(text) > _LONGEST_NUMBER or _INTEGER.fullmatch(text) is None:
+        raise yaml.YAMLError(f"{_where(node)} is not an integer")
     bases = {"0o": 8, "0x": 16}
     number = WrittenInt(text, bases.get(text[:2], 10))
     number.text = text
@@ -100,8 +151,8 @@ def _construct_int(loader: _Loader, node: yaml.ScalarNode) -> int:
 
 def _construct_float(loader: _Loader, node: yaml.ScalarNode) -> float:
     text = str(loader.construct_scalar(node))
-    if _FLOAT.fullmatch(text) is None:
-        raise yaml.YAMLError(f"line {node.start_mark.line + 1}: {text!r} is not a number")
+    if len(text) > _LONGEST_NUMBER or _FLOAT.fullmatch(text) is None:
+        raise yaml.YAMLError(f"{_where(node)} is not a number")
     number = WrittenFloat(re.sub(r"\.(inf|nan)", r"\1", text.lower()))
     number.text = text
     return number
@@ -110,8 +161,12 @@ def _construct_float(loader: _Loader, node: yaml.ScalarNode) -> float:
 def _construct_bool(loader: _Loader, node: yaml.ScalarNode) -> bool:
     text = str(loader.construct_scalar(node)).lower()
     if text not in ("true", "false"):
-        raise yaml.YAMLError(f"line {node.start_mark.line + 1}: {text!r} is not true or false")
+        raise yaml.YAMLError(f"{_where(node)} is not true or false")
     return text == "true"
+
+
+def _where(node: yaml.ScalarNode) -> str:
+    return f"line {node.start_mark.line + 1}: {plain(repr(node.value), 100)}"
 
 
 for _name, _pattern in _RESOLVERS.items():

@@ -10,7 +10,7 @@ from typing import Final
 
 from actors.disturbances.staging import check_suite
 from actors.tasks.contract import Task
-from learner.policy_message import policy_of
+from learner.policy_message import policy_limit, policy_of
 from learner.tutoring.failures import Failures
 from proto.acceptance import misfit, same_situation
 from proto.agreement import OTHER_SETTINGS, Agreement
@@ -113,7 +113,12 @@ class Evaluator:
         keys = self._bus.keys
         rollouts = self._bus.inbox(keys.rollout(), Rollout, capacity=WAITING)
         failures = self._bus.inbox(keys.failure(), EpisodeFailed, capacity=WAITING)
-        self._bus.subscribe_newest(keys.policy, self._on_policy, PolicyVersion)
+        self._bus.subscribe_newest(
+            keys.policy,
+            self._on_policy,
+            PolicyVersion,
+            limit=policy_limit(self._config.network),
+        )
         self._bus.answer(keys.request_trial, TrialRequest, self._hand_out)
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
         with membership(self._bus, self, self._lifecycle):

@@ -29,18 +29,36 @@ from typing import Any, Final, NamedTuple
 import cv2
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.exceptions import InvalidMagic, McapError
-from mcap.records import Channel, McapRecord, Metadata
+from mcap.records import Channel, Metadata
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from numpy.typing import NDArray
-from zstandard import ZstdError
 
 from proto.body import ACTION_NAMES, IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
-from proto.episode import BoxLook, Episode, Floats, Image, Kind, Measure, Outcome, View
+from proto.episode import (
+    BODIES,
+    PHASES,
+    STEPS,
+    BoxLook,
+    Episode,
+    Floats,
+    Image,
+    Kind,
+    Measure,
+    Outcome,
+    View,
+)
 from proto.errors import UserError
+from proto.plain_text import plain
+from proto.reading import read_limited
 from proto.recordings import format1, viewing
+from proto.recordings.mcap_records import (
+    LARGEST_FILE,
+    DamageError,
+    NotMcapError,
+    TooMuchError,
+    whole_records,
+)
 from proto.recordings.schemas import (
     ACTION_FIELDS,
     CameraCalibration,
@@ -85,16 +103,30 @@ _READINGS: Final = ("lenient", "strict", "precise")
 
 # If the process is killed while it writes, at most one chunk is lost, about ten steps.
 CHUNK_BYTES: Final = 64 * 1024
-DAMAGE: Final = (
-    McapError,
-    ZstdError,
-    struct.error,
+_BROKEN: Final = (
+    LookupError,
     ValueError,
-    KeyError,
-    MemoryError,
+    TypeError,
+    AttributeError,
+    RecursionError,
     OverflowError,
+    DecodeError,
+    cv2.error,
 )
-"""Exceptions raised by reading the records of a truncated or damaged file."""
+"""What reading the values of a damaged or foreign episode raises."""
+
+# Limits of what is read, far above what is written.
+_LARGEST_MESSAGE: Final = 2**20
+_LARGEST_PNG: Final = 2**16
+_PNG_BEGINS: Final = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR" + struct.pack(
+    ">II", IMAGE_WIDTH, IMAGE_HEIGHT
+)
+"""Begin of a PNG of the size of the eye's pictures."""
+_MOST_STEPS: Final = STEPS.most
+_MOST_POSES: Final = 2**18
+_MOST_UNITS: Final = 65_536
+_BEGINNING_BYTES: Final = 2**18
+"""The metadata of an episode are within so many bytes from the beginning of its file."""
 
 
 class _Told(NamedTuple):
@@ -149,7 +181,7 @@ def read_episode(path: Path, *, partial: bool = False) -> Episode:
     try:
         expected = int(contents.metadata["episode"]["steps"])
         episode = _episode(contents)
-    except (KeyError, ValueError, TypeError, AttributeError, DecodeError) as error:
+    except _BROKEN as error:
         raise _not_an_episode(path, error) from error
     _check_steps(path, episode.steps, expected, partial=partial)
     return episode
@@ -157,19 +189,22 @@ def read_episode(path: Path, *, partial: bool = False) -> Episode:
 
 def _not_an_episode(path: Path, error: Exception) -> UserError:
     return UserError(
-        f"{path} is an MCAP file, but no episode that this version can read ({error!r})"
+        f"{path} is an MCAP file, but no episode that this version can read"
+        f" ({plain(repr(error), 300)})"
     )
 
 
 def _check_steps(path: Path, steps: int, expected: int, *, partial: bool = False) -> None:
     if expected and not steps:
         raise UserError(
-            f"{path} holds none of the {expected} steps that were played; play the episode again"
+            f"{path} holds none of the {plain(expected, 20)} steps that were played; play the"
+            " episode again"
         )
     if steps != expected and not partial:
         raise UserError(
-            f"{path} holds {steps} of {expected} steps, recovered from a file that was cut "
-            f"off. `vmdnn replay` can show it; for training or counting, play the episode again."
+            f"{path} holds {steps} of {plain(expected, 20)} steps, recovered from a file that"
+            " was cut off. `vmdnn replay` can show it; for training or counting, play the episode"
+            " again."
         )
 
 
@@ -189,6 +224,7 @@ class EpisodeSummary:
     phases: NDArray[np.uint8]
     actions: Floats
     targets: Floats
+    outcome: Outcome
 
 
 def read_summary(path: Path) -> EpisodeSummary:
@@ -200,7 +236,7 @@ def read_summary(path: Path) -> EpisodeSummary:
     contents = _contents(path)
     try:
         texts = contents.metadata["episode"]
-        steps = [Step.FromString(data) for data in contents.messages[STEP]]
+        steps = _steps(contents)
         _check_steps(path, len(steps), int(texts["steps"]))
         shape = (len(steps), len(ACTION_NAMES))
         return EpisodeSummary(
@@ -216,8 +252,9 @@ def read_summary(path: Path) -> EpisodeSummary:
             phases=np.array([step.phase - 1 for step in steps], dtype=np.uint8),
             actions=_floats([_action(step.action) for step in steps], shape),
             targets=_floats([_action(step.target) for step in steps], shape),
+            outcome=_outcome(contents.metadata),
         )
-    except (KeyError, ValueError, TypeError, AttributeError, DecodeError) as error:
+    except _BROKEN as error:
         raise _not_an_episode(path, error) from error
 
 
@@ -228,29 +265,16 @@ def read_kind(path: Path) -> Kind:
         UserError: it cannot be read.
     """
     try:
-        for record in records(path):
+        with path.open("rb") as stream:
+            beginning = stream.read(_BEGINNING_BYTES)
+        for record in whole_records(beginning):
             if isinstance(record, Metadata) and record.name == "episode":
                 return Kind(record.metadata["kind"])
-    except DAMAGE as error:
-        raise UserError(f"{path} is damaged ({error!r})") from error
-    raise UserError(f"{path} is no recording of an episode")
-
-
-def records(path: Path) -> Iterator[McapRecord]:
-    """Yield all records of an MCAP file in order; unpack chunks and verify checksums.
-
-    Raises:
-        UserError: the file cannot be read, or it is not an MCAP file.
-        one of DAMAGE: the file is truncated or damaged after the last record that was yielded.
-    """
-    try:
-        with path.open("rb") as stream:
-            size = path.stat().st_size
-            yield from StreamReader(stream, validate_crcs=True, record_size_limit=size).records
-    except InvalidMagic as error:
-        raise UserError(f"{path} is not an MCAP file") from error
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except (DamageError, *_BROKEN) as error:
+        raise UserError(f"{path} is damaged ({plain(error, 200)})") from error
+    raise UserError(f"{path} is no recording of an episode")
 
 
 @dataclass(frozen=True)
@@ -265,18 +289,44 @@ def _contents(path: Path) -> _Contents:
     contents = _Contents()
     topics: dict[int, str] = {}
     try:
-        for record in records(path):
+        for record in whole_records(read_limited(path, LARGEST_FILE)):
             if isinstance(record, McapMessage):
                 contents.messages[topics[record.channel_id]].append(record.data)
             elif isinstance(record, Channel):
                 topics[record.id] = record.topic
             elif isinstance(record, Metadata):
                 contents.metadata[record.name] = record.metadata
-    except DAMAGE as error:
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except NotMcapError as error:
+        raise UserError(
+            f"{path} is not an MCAP file, or its beginning is damaged; `vmdnn recover {path}` saves"
+            " what is whole of a damaged one"
+        ) from error
+    except TooMuchError as error:
+        raise UserError(
+            f"{path} is no episode of vmdnn, or is damaged: {error}; `vmdnn recover {path}` saves"
+            " what is whole of a damaged one"
+        ) from error
+    except (DamageError, KeyError) as error:
         raise UserError(
             f"{path} is cut off or damaged; run `vmdnn recover {path}` to save what is whole of it"
         ) from error
     return contents
+
+
+def _steps(contents: _Contents) -> list[Any]:
+    """Read all messages of `/step`, and check the sizes of all messages before others are read.
+
+    `/step` is the last message of a step, so a step with a `/step` message is complete.
+    """
+    for topic in (EYE, CALIBRATION, JOINTS, TRANSFORMS, STATES, STEP):
+        if any(len(data) > _LARGEST_MESSAGE for data in contents.messages[topic]):
+            raise ValueError(f"{topic} has a message of more than {_LARGEST_MESSAGE} bytes")
+    count = len(contents.messages[STEP])
+    if count > _MOST_STEPS:
+        raise ValueError(f"it has {count} steps; at most {_MOST_STEPS} are possible")
+    return [Step.FromString(data) for data in contents.messages[STEP]]
 
 
 def _register(writer: Writer, topic: str) -> int:
@@ -386,9 +436,8 @@ def _step(episode: Episode, step: int) -> Message:
 
 def _episode(contents: _Contents) -> Episode:
     texts = contents.metadata["episode"]
-    names = tuple(json.loads(texts["body_names"]))
-    # `/step` is the last message of a step, so a step with a `/step` message is complete.
-    steps = [Step.FromString(data) for data in contents.messages[STEP]]
+    names = tuple(_names(texts["body_names"], BODIES.most))
+    steps = _steps(contents)
     count = len(steps)
     outputs_size = json.loads(texts["outputs"])
     return Episode(
@@ -413,7 +462,7 @@ def _episode(contents: _Contents) -> Episode:
         outcome=_outcome(contents.metadata),
         outputs=None
         if outputs_size is None
-        else _floats([step.outputs for step in steps], (count, outputs_size)),
+        else _rows([step.outputs for step in steps], outputs_size),
         control_period_s=float(texts["control_period_s"]),
         states=_states(contents.messages[STATES][:count], json.loads(texts.get("states", "null"))),
         training=texts.get("training", ""),  # older recordings do not have this field
@@ -475,11 +524,15 @@ def _view(contents: _Contents, steps: int) -> View | None:
     """The view of an episode; None if it has none, as in files of formats 1 and 2."""
     if "fixed_links" not in contents.metadata:
         return None
+    if len(contents.metadata["fixed_links"]) > BODIES.most:
+        raise ValueError("it has too many fixed links")
     boxes = {name: json.loads(text) for name, text in contents.metadata["boxes"].items()}
     fixed = contents.metadata["fixed_links"].items()
     focal = []
     for data in contents.messages[CALIBRATION][:steps]:
         camera = CameraCalibration.FromString(data).K
+        if len(camera) != 9:
+            raise ValueError(f"a camera matrix has {len(camera)} numbers")
         focal.append((camera[0], camera[4]))
     return View(
         boxes={name: BoxLook(_axes(size), _axes(colour)) for name, (size, colour) in boxes.items()},
@@ -540,7 +593,14 @@ def _outcome(metadata: Mapping[str, Mapping[str, str]]) -> Outcome:
 def _phase_names(texts: Mapping[str, str]) -> tuple[str, ...]:
     if texts["format"] == "1":
         return format1.phase_names()
-    return tuple(str(name) for name in json.loads(texts["phase_names"]))
+    return tuple(str(name) for name in _names(texts["phase_names"], PHASES.most))
+
+
+def _names(text: str, most: int) -> list[Any]:
+    names = json.loads(text)
+    if not isinstance(names, list) or len(names) > most:
+        raise ValueError(f"expected a list of at most {most} names")
+    return names
 
 
 def _check_format(path: Path, contents: _Contents) -> None:
@@ -570,8 +630,10 @@ def _png(image: Image) -> bytes:
 def _images(messages: Sequence[bytes]) -> Image:
     images = np.empty((len(messages), IMAGE_HEIGHT, IMAGE_WIDTH), dtype=np.uint8)
     for step, data in enumerate(messages):
-        png = np.frombuffer(CompressedImage.FromString(data).data, dtype=np.uint8)
-        image = cv2.imdecode(png, cv2.IMREAD_GRAYSCALE)
+        png = CompressedImage.FromString(data).data
+        if len(png) > _LARGEST_PNG or not png.startswith(_PNG_BEGINS):
+            raise ValueError(f"the picture of step {step} is no PNG of the eye's size")
+        image = cv2.imdecode(np.frombuffer(png, dtype=np.uint8), cv2.IMREAD_GRAYSCALE)
         if image is None:
             raise ValueError(f"the picture of step {step} is not a PNG")
         images[step] = image
@@ -585,15 +647,30 @@ def _states(messages: Sequence[bytes], units: Mapping[str, int] | None) -> dict[
     for data in messages:
         for subnet in States.FromString(data).subnets:
             rows[subnet.name].append(subnet.activity)
-    return {name: _floats(rows[name], (len(messages), size)) for name, size in units.items()}
+    if any(len(rows[name]) != len(messages) for name in units):
+        raise ValueError("a step lacks the states of a subnet")
+    return {name: _rows(rows[name], size) for name, size in units.items()}
+
+
+def _rows(rows: Sequence[Sequence[float]], size: int) -> Floats:
+    """Values (T, size) of numbers of each step, of which there must be as many as told."""
+    if not 0 <= size <= _MOST_UNITS or any(len(row) != size for row in rows):
+        raise ValueError(f"a step has not {plain(size, 20)} numbers")
+    values = np.empty((len(rows), size), dtype=np.float32)
+    for step, row in enumerate(rows):
+        values[step] = row
+    return values
 
 
 def _joints_deg(messages: Sequence[bytes]) -> Floats:
-    radians = [
-        [joint.position for joint in JointStates.FromString(data).joints] for data in messages
-    ]
     # In float64, so that converting to degrees and rounding to float32 is exact.
-    return np.degrees(_array(radians, (len(messages), len(JOINT_NAMES)))).astype(np.float32)
+    radians = np.empty((len(messages), len(JOINT_NAMES)), dtype=np.float64)
+    for step, data in enumerate(messages):
+        joints = JointStates.FromString(data).joints
+        if len(joints) != len(JOINT_NAMES):
+            raise ValueError(f"step {step} has {len(joints)} joints")
+        radians[step] = [joint.position for joint in joints]
+    return np.degrees(radians).astype(np.float32)
 
 
 def _action(action: Any) -> list[float]:
@@ -601,22 +678,21 @@ def _action(action: Any) -> list[float]:
 
 
 def _poses(messages: Sequence[bytes], bodies: int) -> Floats:
-    poses = []
-    for data in messages:
-        for transform in FrameTransforms.FromString(data).transforms[:bodies]:
-            position, rotation = transform.translation, transform.rotation
-            poses.append(
-                (
-                    *(position.x, position.y, position.z),
-                    *(rotation.w, rotation.x, rotation.y, rotation.z),
-                )
+    if bodies * len(messages) > _MOST_POSES:
+        raise ValueError(f"it has more than {_MOST_POSES} poses")
+    poses = np.empty((len(messages), bodies, 7), dtype=np.float32)
+    for step, data in enumerate(messages):
+        transforms = FrameTransforms.FromString(data).transforms
+        if len(transforms) < bodies:
+            raise ValueError(f"step {step} has {len(transforms)} of {bodies} bodies")
+        for body in range(bodies):
+            position, rotation = transforms[body].translation, transforms[body].rotation
+            poses[step, body] = (
+                *(position.x, position.y, position.z),
+                *(rotation.w, rotation.x, rotation.y, rotation.z),
             )
-    return _floats(poses, (len(messages), bodies, 7))
+    return poses
 
 
 def _floats(rows: Sequence[Any], shape: tuple[int, ...]) -> Floats:
-    return _array(rows, shape).astype(np.float32)
-
-
-def _array(rows: Sequence[Any], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    return np.array(rows, dtype=np.float64).reshape(shape)
+    return np.array(rows, dtype=np.float64).reshape(shape).astype(np.float32)

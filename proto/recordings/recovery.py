@@ -1,7 +1,8 @@
-"""Recovery of the complete records of a truncated MCAP file."""
+"""Recovery of the whole records of a damaged MCAP file."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,16 @@ from mcap.records import (
 from mcap.writer import Writer
 
 from proto.errors import UserError
-from proto.recordings.episodes import CHUNK_BYTES, DAMAGE, STEP, records
+from proto.reading import read_limited
+from proto.recordings.episodes import CHUNK_BYTES, STEP
+from proto.recordings.mcap_records import (
+    LARGEST_FILE,
+    MAGIC,
+    DamageError,
+    TooMuchError,
+    salvaged_records,
+    whole_records,
+)
 from proto.storage import written_whole
 
 
@@ -30,7 +40,7 @@ class Recovered:
 
     Attributes:
         intact: the file was complete, so there was nothing to recover.
-        messages: number of complete messages.
+        messages: number of whole messages.
         steps: number of complete control steps of the episode.
         steps_played: number of control steps that were played; None if the file is not an episode.
     """
@@ -42,17 +52,20 @@ class Recovered:
 
 
 def recover(path: Path, out: Path | None = None) -> Recovered:
-    """Write an MCAP file with all complete records of another one.
+    """Write an MCAP file with all whole records of another one, wherever that is damaged.
+
+    Only the messages of a damaged chunk are lost. A message whose channel is nowhere described is
+    kept in a channel `lost/NUMBER`.
 
     Args:
         path: any MCAP file. It is not changed, unless it is also `out`.
         out: the file to write; None replaces `path`, unless `path` is intact.
 
     Raises:
-        UserError: `path` cannot be read, is not MCAP, has no complete message or is an episode cut
-            off before its first step was complete, or `out` cannot be written.
+        UserError: `path` cannot be read, is not MCAP, has no whole message or is an episode without
+            any complete step, or `out` cannot be written.
     """
-    kept, intact = _whole_records(path)
+    kept, intact = _records(path)
     found = _count(kept, intact)
     if not found.messages:
         raise UserError(f"{path} has no complete message, so nothing can be recovered")
@@ -62,23 +75,31 @@ def recover(path: Path, out: Path | None = None) -> Recovered:
         )
     in_place = out is None or out.resolve() == path.resolve()
     if not (intact and in_place):
-        with written_whole(out or path) as stream:
-            _write(kept, stream)
+        try:
+            with written_whole(out or path) as stream:
+                _write(kept, stream)
+        except struct.error as error:
+            raise UserError(f"{path} has more channels or schemas than MCAP can hold") from error
     return found
 
 
-def _whole_records(path: Path) -> tuple[list[McapRecord], bool]:
-    """Return the data records before the first damage, and whether there is no damage."""
-    kept: list[McapRecord] = []
-    in_data = True  # the records after the data section only repeat and index it
+def _records(path: Path) -> tuple[list[McapRecord], bool]:
+    """The whole records of a file, and whether it is undamaged."""
     try:
-        for record in records(path):
-            in_data = in_data and not isinstance(record, DataEnd)
-            if in_data:
-                kept.append(record)
-    except DAMAGE:
-        return kept, False
-    return kept, True
+        content = read_limited(path, LARGEST_FILE)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    try:
+        return list(whole_records(content)), True
+    except DamageError:
+        pass
+    try:
+        kept = salvaged_records(content)
+    except TooMuchError as error:
+        raise UserError(f"{path} is not recovered: {error}") from error
+    if not kept and not content.startswith(MAGIC):
+        raise UserError(f"{path} is not an MCAP file")
+    return kept, False
 
 
 def _count(kept: Sequence[McapRecord], intact: bool) -> Recovered:
@@ -91,7 +112,8 @@ def _count(kept: Sequence[McapRecord], intact: bool) -> Recovered:
         for record in kept
         if isinstance(record, Metadata)
         and record.name == "episode"
-        and record.metadata.get("steps", "").isdecimal()
+        and record.metadata.get("steps", "")[:10].isdecimal()
+        and len(record.metadata["steps"]) < 10
     ]
     return Recovered(
         intact=intact,
@@ -105,24 +127,19 @@ def _write(kept: Sequence[McapRecord], stream: BinaryIO) -> None:
     writer = Writer(stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
     header = next((record for record in kept if isinstance(record, Header)), Header("", ""))
     writer.start(header.profile, header.library)
-    schemas, channels = {0: 0}, {}
-    for record in kept:
+    for record in _data_of(kept):
         if isinstance(record, Metadata):
             writer.add_metadata(record.name, record.metadata)
         elif isinstance(record, Attachment):
             writer.add_attachment(
                 record.create_time, record.log_time, record.name, record.media_type, record.data
             )
-        elif isinstance(record, Schema) and record.id not in schemas:
-            schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
-        elif isinstance(record, Channel) and record.id not in channels:
-            channels[record.id] = writer.register_channel(
-                record.topic,
-                record.message_encoding,
-                schemas[record.schema_id],
-                record.metadata,
-            )
-        elif isinstance(record, Message):
+    channels = _register(kept, writer)
+    for record in kept:
+        if isinstance(record, Message):
+            if record.channel_id not in channels:
+                lost = f"lost/{record.channel_id}"
+                channels[record.channel_id] = writer.register_channel(lost, "", 0)
             writer.add_message(
                 channels[record.channel_id],
                 record.log_time,
@@ -131,3 +148,29 @@ def _write(kept: Sequence[McapRecord], stream: BinaryIO) -> None:
                 record.sequence,
             )
     writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _data_of(kept: Sequence[McapRecord]) -> Sequence[McapRecord]:
+    """The records before the end of the data; what follows repeats and indexes them."""
+    ends = [number for number, record in enumerate(kept) if isinstance(record, DataEnd)]
+    return kept[: ends[0]] if ends else kept
+
+
+def _register(kept: Sequence[McapRecord], writer: Writer) -> dict[int, int]:
+    """Describe schemas and channels; the number of each channel in the new file by the old one.
+
+    The first description of a number counts: in a chunk it has a checksum, in the summary not.
+    """
+    schemas, channels = {0: 0}, {}
+    for record in kept:
+        if isinstance(record, Schema) and record.id not in schemas:
+            schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+    for record in kept:
+        if isinstance(record, Channel) and record.id not in channels:
+            channels[record.id] = writer.register_channel(
+                record.topic,
+                record.message_encoding,
+                schemas.get(record.schema_id, 0),
+                record.metadata,
+            )
+    return channels

@@ -1,4 +1,4 @@
-"""`vmdnn recover`: restore the intact part of a truncated MCAP file."""
+"""`vmdnn recover`: save what is whole of a damaged or truncated MCAP file."""
 
 from __future__ import annotations
 

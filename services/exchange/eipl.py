@@ -11,6 +11,8 @@ A shorter sequence repeats its last step. EIPL does not name joints.
 
 from __future__ import annotations
 
+import tokenize
+import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -21,11 +23,26 @@ from numpy.typing import NDArray
 from proto.body import ACTION_NAMES
 from proto.episode import Episode
 from proto.errors import UserError
+from proto.plain_text import plain
 from proto.storage import written_whole
-from services.exchange.foreign import foreign_episode
+from services.exchange.foreign import MOST_STEPS, check_picture, eye_picture, foreign_episode
 from services.exchange.joint_map import JointMap
 
 SETS: Final = ("train", "test")
+_BROKEN: Final = (
+    OSError,
+    ValueError,
+    TypeError,
+    EOFError,
+    SyntaxError,
+    LookupError,
+    RecursionError,
+    OverflowError,
+    MemoryError,
+    zipfile.BadZipFile,
+    tokenize.TokenError,
+)
+"""What reading a damaged file raises."""
 _LEAST_RANGE: Final = 1e-2
 """Bounds that are nearer are widened: EIPL divides by the range of a joint."""
 
@@ -82,7 +99,11 @@ def import_eipl(folder: Path, joint_map: JointMap | None, task: str) -> Iterator
                 values[:steps], joint_map.names, f"{part}, sequence {number}"
             )
             yield foreign_episode(
-                pictures[:steps], targets, task=task, origin="eipl", fps=joint_map.fps or 10.0
+                np.stack([eye_picture(picture) for picture in pictures[:steps]]),
+                targets,
+                task=task,
+                origin="eipl",
+                fps=joint_map.fps or 10.0,
             )
 
 
@@ -111,10 +132,12 @@ def _lengthened(values: NDArray[Any], steps: int) -> NDArray[Any]:
 
 def _steps_without_repetition(pictures: NDArray[Any], values: NDArray[Any]) -> int:
     """Number of steps without those at the end that only repeat the last one."""
-    same = (values == values[-1]).all(axis=1)
-    same &= (pictures == pictures[-1]).reshape(len(pictures), -1).all(axis=1)
-    differing = np.flatnonzero(~same)
-    return min(len(values), int(differing[-1]) + 2) if len(differing) else 1
+    steps = len(values)
+    while steps > 1 and np.array_equal(values[steps - 2], values[-1], equal_nan=False):
+        if not np.array_equal(pictures[steps - 2], pictures[-1]):
+            break
+        steps -= 1
+    return steps
 
 
 def _bounds(values: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -131,8 +154,10 @@ def _write(path: Path, array: NDArray[Any]) -> None:
 def _read(path: Path) -> NDArray[Any]:
     try:
         return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError) as error:
-        raise UserError(f"{path} cannot be read as an array of numpy: {error}") from error
+    except _BROKEN as error:
+        raise UserError(
+            f"{path} cannot be read as an array of numpy: {plain(error, 300)}"
+        ) from error
 
 
 def _check(part: Path, images: NDArray[Any], joints: NDArray[Any]) -> None:
@@ -141,6 +166,16 @@ def _check(part: Path, images: NDArray[Any], joints: NDArray[Any]) -> None:
             f"{part / 'images.npy'} is {images.dtype} {images.shape}, not uint8 (N, T, height,"
             " width, 3)"
         )
+    try:
+        check_picture(*images.shape[2:4])
+    except ValueError as error:
+        raise UserError(f"{part / 'images.npy'}: {error}") from error
+    if not 1 <= images.shape[1] <= MOST_STEPS:
+        raise UserError(
+            f"{part / 'images.npy'} has {images.shape[1]} steps; 1 to {MOST_STEPS} are possible"
+        )
+    if joints.dtype.kind not in "fiu":
+        raise UserError(f"{part / 'joints.npy'} is {plain(joints.dtype, 100)}, not numbers")
     if joints.ndim != 3 or joints.shape[:2] != images.shape[:2]:
         raise UserError(
             f"{part / 'joints.npy'} is {joints.shape}, which does not fit the"

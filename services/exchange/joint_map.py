@@ -26,8 +26,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from proto.body import ACTION_NAMES, ACTION_VALUES, FOCUS, GRASP
 from proto.episode import Floats
 from proto.errors import UserError
+from proto.plain_text import plain, plain_lines
+from proto.reading import read_limited
 from proto.recordings.schemas import ACTION_FIELDS
-from proto.strict_yaml import load_yaml
+from proto.strict_yaml import LONGEST, load_yaml
 
 _ROUNDING: Final = 1e-3
 
@@ -123,20 +125,20 @@ def read_joint_map(path: Path) -> JointMap:
         UserError: the file cannot be read, or is not a map with all eleven action values.
     """
     try:
-        joint_map = JointMap.model_validate(load_yaml(path.read_text()))
+        joint_map = JointMap.model_validate(load_yaml(read_limited(path, LONGEST).decode()))
     except OSError as error:
         raise UserError(f"joint map {path} cannot be read: {error.strerror}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise UserError(f"joint map {path} is not YAML: {error}") from error
+        raise UserError(f"joint map {path} is not YAML: {plain_lines(error)[:1000]}") from error
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise UserError(f"joint map {path}: {key}: {first['msg']}") from error
+        key = plain(".".join(map(str, first["loc"])), 200)
+        raise UserError(f"joint map {path}: {key}: {plain(first['msg'], 300)}") from error
     if missing := [name for name in ACTION_NAMES if name not in joint_map.joints]:
         raise UserError(
             f"joint map {path}: joints: {', '.join(missing)} missing; give each of"
             f" {', '.join(ACTION_NAMES)} a joint of theirs or a number"
         )
     if unknown := sorted(joint_map.joints.keys() - set(ACTION_NAMES)):
-        raise UserError(f"joint map {path}: joints: there is no {', '.join(unknown)}")
+        raise UserError(f"joint map {path}: joints: there is no {plain(', '.join(unknown), 300)}")
     return joint_map

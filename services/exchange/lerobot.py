@@ -15,6 +15,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -29,9 +30,11 @@ from numpy.typing import NDArray
 from proto.body import IMAGE_HEIGHT, IMAGE_WIDTH, JOINT_NAMES
 from proto.episode import Episode, Image
 from proto.errors import UserError
+from proto.plain_text import plain
+from proto.reading import read_limited
 from proto.recordings.schemas import ACTION_FIELDS
 from proto.storage import written_whole
-from services.exchange.foreign import foreign_episode
+from services.exchange.foreign import check_picture, eye_picture, foreign_episode
 from services.exchange.joint_map import JointMap, own_map
 from services.exchange.lerobot_statistics import (
     Statistics,
@@ -50,6 +53,27 @@ CHUNK: Final = 1000
 DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+_LARGEST_INFO: Final = 2**20
+_LARGEST_PICTURE: Final = 64 * 2**20
+_PLACE: Final = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk_index|file_index)(?::0?[0-9]d)?)\})*")
+"""What may stand in a path of `info.json`: a format of Python could ask for any width."""
+_MOST_ROWS: Final = 100_000
+_ROWS_PER_BYTE: Final = 1
+_UNPACKED_BYTES: Final = 16 * 2**20
+_UNPACKED_PER_BYTE: Final = 16
+_PIXELS: Final = 30_000_000
+_PIXELS_PER_BYTE: Final = 200
+"""Limits of what a file may become: those of a file of tables, and of a video."""
+_BROKEN: Final = (
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    RecursionError,
+    OverflowError,
+    MemoryError,
+)
+"""What reading damaged data raises, besides errors of the libraries."""
 EPISODES_IN_FILE: Final = 200
 """Episodes in one file of data or video; such files stay below 100 MB."""
 
@@ -399,26 +423,31 @@ def import_lerobot(folder: Path, joint_map: JointMap | None, task: str) -> Itera
             yield foreign_episode(
                 pictures, targets, task=task, origin="lerobot", fps=float(info["fps"])
             )
-    except (pa.ArrowException, av.FFmpegError, KeyError, TypeError, ValueError, OSError) as error:
-        raise UserError(f"{folder} is damaged or not complete: {error!r}") from error
+    except (pa.ArrowException, av.FFmpegError, cv2.error, OSError, *_BROKEN) as error:
+        raise UserError(
+            f"{folder} is damaged or not complete: {plain(repr(error), 500)}"
+        ) from error
 
 
 def _read_info(folder: Path) -> dict[str, Any]:
     path = folder / "meta" / "info.json"
     try:
-        info: dict[str, Any] = json.loads(path.read_text())
-        version, _ = info["codebase_version"], info["features"][ACTION]
-        valid = float(info["fps"]) > 0
+        info: dict[str, Any] = json.loads(read_limited(path, _LARGEST_INFO))
+        version, features = info["codebase_version"], info["features"]
+        valid = float(info["fps"]) > 0 and all(isinstance(f, dict) for f in features.values())
+        _ = features[ACTION]
     except OSError as error:
         raise UserError(
             f"{folder} is no LeRobotDataset: {path} cannot be read ({error.strerror})"
         ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} does not describe a data set with actions ({error!r})") from error
+    except _BROKEN as error:
+        raise UserError(
+            f"{path} does not describe a data set with actions ({plain(repr(error), 300)})"
+        ) from error
     if version != VERSION or not valid:
         raise UserError(
-            f"{folder} has version {version}; this reads {VERSION}: convert it with LeRobot's own"
-            " conversion script"
+            f"{folder} has version {plain(version, 100)}; this reads {VERSION}: convert it with"
+            " LeRobot's own conversion script"
         )
     return info
 
@@ -462,14 +491,12 @@ class _Reader:
         if not files:
             raise UserError(f"{self._folder} lists no episodes in meta/episodes")
         for file in files:
-            yield from self._pq.read_table(file).to_pylist()
+            yield from self._read(file).to_pylist()
 
-    def steps(
-        self, row: Mapping[str, Any], key: str
-    ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-        """Actions (T, D) and pictures (T, height, width, 3) of an episode."""
+    def steps(self, row: Mapping[str, Any], key: str) -> tuple[NDArray[np.float64], Image]:
+        """Actions (T, D) and pictures (T, 48, 64) of an episode."""
         place = {"chunk_index": row["data/chunk_index"], "file_index": row["data/file_index"]}
-        table = self._table(self._folder / self._info["data_path"].format(**place))
+        table = self._table(self._path(self._info["data_path"], place))
         chosen = np.flatnonzero(
             table.column("episode_index").to_numpy() == int(row["episode_index"])
         )
@@ -480,30 +507,101 @@ class _Reader:
         packed = part.column(key).to_pylist()
         return actions, np.stack([self._decoded(each) for each in packed])
 
+    def _path(self, template: str, place: Mapping[str, Any]) -> Path:
+        """A file of the data set.
+
+        Raises:
+            ValueError: the path is none inside the data set.
+        """
+        if _PLACE.fullmatch(template) is None:
+            raise ValueError(f"{template[:100]!r} is no path of a file")
+        return self._inside(template.format(**place))
+
+    def _inside(self, name: str) -> Path:
+        path = (self._folder / name).resolve()
+        if not path.is_relative_to(self._folder.resolve()):
+            raise ValueError(f"{name[:100]!r} lies outside of the data set")
+        return path
+
     def _table(self, path: Path) -> Any:
         if self._data is None or self._data[0] != path:
-            self._data = (path, self._pq.read_table(path))
+            self._data = (path, self._read(path))
         return self._data[1]
 
-    def _decoded(self, packed: Mapping[str, Any]) -> NDArray[np.uint8]:
+    def _read(self, path: Path) -> Any:
+        """Read a table; refuse one that says that it is much larger than its file."""
+        size = path.stat().st_size
+        metadata = self._pq.read_metadata(path)
+        unpacked = sum(
+            metadata.row_group(number).total_byte_size for number in range(metadata.num_row_groups)
+        )
+        if (
+            metadata.num_rows > _MOST_ROWS + _ROWS_PER_BYTE * size
+            or unpacked > _UNPACKED_BYTES + _UNPACKED_PER_BYTE * size
+        ):
+            raise ValueError(f"{path} is too large when it is unpacked")
+        return self._pq.read_table(path)
+
+    def _decoded(self, packed: Mapping[str, Any]) -> Image:
         content = packed["bytes"]
         if content is None:
-            content = (self._folder / packed["path"]).read_bytes()
+            content = read_limited(self._inside(packed["path"]), _LARGEST_PICTURE)
+        check_picture(*_size_of_picture(content))
         picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR_RGB)
         if picture is None:
             raise ValueError("a picture cannot be decoded")
-        return np.asarray(picture, dtype=np.uint8)
+        return eye_picture(np.asarray(picture, dtype=np.uint8))
 
-    def _frames(self, row: Mapping[str, Any], key: str) -> NDArray[np.uint8]:
+    def _frames(self, row: Mapping[str, Any], key: str) -> Image:
         prefix = f"videos/{key}"
-        path = self._folder / self._info["video_path"].format(
-            video_key=key,
-            chunk_index=row[f"{prefix}/chunk_index"],
-            file_index=row[f"{prefix}/file_index"],
-        )
+        place = {
+            "video_key": key,
+            "chunk_index": row[f"{prefix}/chunk_index"],
+            "file_index": row[f"{prefix}/file_index"],
+        }
+        path = self._path(self._info["video_path"], place)
         if self._video is None or self._video[0] != path:
-            with av.open(str(path)) as container:
-                decoded = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
-            self._video = (path, np.stack(decoded))
+            self._video = (path, _video_pictures(path))
         first = round(row[f"{prefix}/from_timestamp"] * self._info["fps"])
         return self._video[1][first : first + int(row["length"])]
+
+
+def _video_pictures(path: Path) -> Image:
+    """The pictures (N, 48, 64) of a video.
+
+    Raises:
+        ValueError: it has none, or more than a video of its size has.
+    """
+    left = _PIXELS + _PIXELS_PER_BYTE * path.stat().st_size
+    pictures = []
+    with av.open(str(path)) as container:
+        for stream in container.streams.video[:1]:
+            check_picture(stream.codec_context.height, stream.codec_context.width)
+        for frame in container.decode(video=0):
+            left -= frame.width * frame.height
+            if left < 0:
+                raise ValueError(f"{path} has more pictures than a video of its size")
+            pictures.append(
+                eye_picture(np.asarray(frame.to_ndarray(format="rgb24"), dtype=np.uint8))
+            )
+    return np.stack(pictures)
+
+
+def _size_of_picture(content: bytes) -> tuple[int, int]:
+    """Height and width of a PNG or JPEG, without decoding it.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    if content.startswith(b"\x89PNG\r\n\x1a\n") and len(content) > 24:
+        return int.from_bytes(content[20:24], "big"), int.from_bytes(content[16:20], "big")
+    at = 2
+    while content.startswith(b"\xff\xd8") and at + 9 < len(content) and content[at] == 0xFF:
+        marker, length = content[at + 1], int.from_bytes(content[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a frame's header
+            return (
+                int.from_bytes(content[at + 5 : at + 7], "big"),
+                int.from_bytes(content[at + 7 : at + 9], "big"),
+            )
+        at += 2 + length
+    raise ValueError("a picture is neither PNG nor JPEG")

@@ -30,6 +30,7 @@ from proto.episode import (
 )
 from proto.errors import UserError
 from proto.messages import Count, EpisodeFailed, Rollout
+from proto.plain_text import plain
 from proto.recordings import format1
 from proto.storage import append_line, drop_unfinished_line
 from proto.suites import UNLEARNED, Conditions, suite_of
@@ -41,6 +42,10 @@ FORMAT: Final = 3
 """Newest format of lines; lines of format 1 can be read too. Lines of the suite `unlearned` are
 written in format 2, as before there were suites; those of other suites in format 3."""
 _PLAIN_FORMAT: Final = 2
+_SHORTEST_LINE: Final = 100
+"""Bytes of the shortest line; shorter ones are not parsed at all."""
+_TOLD: Final = 5
+"""The log has so many of the damaged lines that are found at the start, and their number."""
 
 
 @message("counted_trial", 2, form="json")
@@ -110,7 +115,7 @@ def read_trials(path: Path) -> list[CountedTrial]:
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     try:
-        return [_parse_line(line) for line in lines]
+        return [parse_line(line) for line in lines]
     except MessageError as error:
         raise UserError(
             f"{path} is not a file of counted trials ({error});"
@@ -118,13 +123,16 @@ def read_trials(path: Path) -> list[CountedTrial]:
         ) from error
 
 
-def _parse_line(line: bytes) -> CountedTrial:
+def parse_line(line: bytes) -> CountedTrial:
     """Parse a line of format 1, 2 or 3.
 
     Raises:
         MessageError: the line is not a counted trial, or its format is newer.
     """
-    encoding = schema_of(CountedTrial).encoding
+    schema = schema_of(CountedTrial)
+    encoding = schema.encoding
+    if not _SHORTEST_LINE <= len(line) <= schema.limit:
+        raise MessageError("payload", f"a line of {len(line)} bytes is no counted trial")
     try:
         values = json.loads(line)
         number = values.setdefault("format", 1)
@@ -133,13 +141,22 @@ def _parse_line(line: bytes) -> CountedTrial:
             values["outcome"] = record_of(Outcome).pack(outcome)
             values["format"] = _PLAIN_FORMAT
             line = json.dumps(values).encode()
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise MessageError("payload", f"is not a counted trial: {error!r:.128}") from error
+    except (
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        RecursionError,
+        OverflowError,
+    ) as error:
+        raise MessageError(
+            "payload", f"is not a counted trial: {plain(repr(error), 128)}"
+        ) from error
     if isinstance(number, int) and number > FORMAT:
         raise MessageError(
             "format",
-            f"{number} was written by a newer vmdnn; this one reads formats up to {FORMAT}:"
-            " update vmdnn to read it",
+            f"{plain(number, 100)} was written by a newer vmdnn; this one reads formats up to"
+            f" {FORMAT}: update vmdnn to read it",
         )
     return decode(Wire(encoding, line), CountedTrial)
 
@@ -164,6 +181,8 @@ class TrialLog:
         content = path.read_bytes() if path.exists() else b""
         for number, line in enumerate(content.splitlines(), 1):
             self._read(line, number)
+        if self.damaged > _TOLD:
+            LOG.warning("%s: %d lines are not counted", path, self.damaged)
 
     def add(self, rollout: Rollout) -> bool:
         """Write a trial to disk and count it.
@@ -220,8 +239,15 @@ class TrialLog:
         return new
 
     def _read(self, line: bytes, number: int) -> None:
+        if len(line) < _SHORTEST_LINE:
+            self._skip(number, f"it has only {len(line)} bytes")
+            return
         try:
-            self._count(_parse_line(line))
+            self._count(parse_line(line))
         except MessageError as error:
-            self.damaged += 1
-            LOG.warning("%s, line %d is not counted: %s", self._path, number, error)
+            self._skip(number, str(error))
+
+    def _skip(self, number: int, problem: str) -> None:
+        self.damaged += 1
+        if self.damaged <= _TOLD:
+            LOG.warning("%s, line %d is not counted: %s", self._path, number, problem)

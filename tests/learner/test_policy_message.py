@@ -16,12 +16,14 @@ from hypothesis import strategies as st
 from safetensors.numpy import load, save
 
 from learner.checkpoint import checkpoint_from_bytes
+from learner.network.subnets import LARGEST_NETWORK
 from learner.network_policy import NetworkPolicy
-from learner.policy_message import policy_of
+from learner.policy_message import policy_limit, policy_of
+from proto.bus import LARGEST_MESSAGE
 from proto.codec import MessageError, Wire, decode, encode
 from proto.config import load_config
 from proto.errors import UserError
-from proto.messages import PolicyVersion
+from proto.messages import POLICY_LIMIT, PolicyVersion
 
 CONFIG = load_config(None, ["run.name=test"])
 GOOD = make_policy(3)
@@ -107,6 +109,20 @@ def test_versions_have_a_bound(version: int) -> None:
 def test_a_version_takes_an_epoch() -> None:
     with pytest.raises(ValueError, match="version 31 cannot come after 30 epochs"):
         replace(GOOD, version=31)
+
+
+def test_the_network_of_the_run_limits_the_size_of_a_policy() -> None:
+    """A larger message is refused before it is decoded; the limit is near the real size."""
+    wire, limit = encode(GOOD), policy_limit(CONFIG.network)
+    assert decode(wire, PolicyVersion, limit=limit) == GOOD
+    assert len(wire.payload) < limit < len(wire.payload) + 2**18
+    large = encode(replace(GOOD, weights=bytes(limit)))
+    with pytest.raises(MessageError, match=f"expected at most {limit} bytes"):
+        decode(large, PolicyVersion, limit=limit)
+
+
+def test_the_largest_possible_network_fits_into_a_message() -> None:
+    assert 4 * LARGEST_NETWORK + 2**18 < POLICY_LIMIT < LARGEST_MESSAGE
 
 
 JSON = st.recursive(

@@ -16,7 +16,7 @@ import zenoh
 from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop
 
-from proto.bus import Bus, open_bus, open_hub
+from proto.bus import LARGEST_MESSAGE, Bus, open_bus, open_hub
 from proto.codec import encode
 from proto.config import HubConfig
 from proto.errors import UserError
@@ -325,6 +325,19 @@ def test_a_stopped_hub_ends_cleanly() -> None:
     with network() as net:
         net.join(Role.ACTOR, "actor")
         assert stop(net.hub) == 0
+
+
+def test_a_message_that_is_too_large_is_not_passed_on_and_harms_nobody(shared: Network) -> None:
+    sender, reader = shared.join(Role.LEARNER, "large-1"), shared.join(Role.ACTOR, "large-2")
+    inbox = reader.inbox("vmdnn/test/large", PolicyVersion, capacity=5)
+    stranger = shared.stranger()
+    publisher = stranger.declare_publisher("vmdnn/test/large")
+    eventually(lambda: publisher.matching_status.matching, "a subscriber")
+    publisher.put(bytes(LARGEST_MESSAGE + 2**20))
+    matched(sender, "vmdnn/test/large")
+    sender.deliver("vmdnn/test/large", policy(1))
+    assert inbox.take(timeout_s=30.0) == policy(1)
+    assert reader.refused == 0
 
 
 def test_large_messages_go_through_shared_memory_too(shared: Network) -> None:

@@ -221,6 +221,26 @@ def test_a_damaged_file_is_put_aside(
     assert "is damaged" in caplog.text
 
 
+def test_a_message_whose_content_is_damaged_is_not_sent(tmp_path: Path, link: Link) -> None:
+    Outbox(tmp_path, link).add("a", "key", wire("content"))
+    (path,) = tmp_path.glob("*.message")
+    path.write_bytes(path.read_bytes().replace(b"content", b"cOntent"))
+    link.take()
+    outbox = Outbox(tmp_path, link)
+    outbox.send_due()
+    assert link.take() == []
+    assert (len(outbox), outbox.put_aside) == (0, 1)
+
+
+def test_a_file_larger_than_any_message_is_not_read(tmp_path: Path, link: Link) -> None:
+    path = tmp_path / "1-a.message"
+    with path.open("wb") as stream:
+        stream.truncate(2**40)  # a sparse file
+    outbox = Outbox(tmp_path, link)
+    outbox.send_due()
+    assert (len(outbox), outbox.put_aside) == (0, 1)
+
+
 def test_a_message_leaves_when_all_its_receivers_have_it(
     outbox: Outbox, link: Link, clock: Clock, tmp_path: Path
 ) -> None:

@@ -40,6 +40,17 @@ def test_values(text: str, value: Any) -> None:
     assert isinstance(read, type(value))
 
 
+LAUGHS = "a0: &a0 [x, x]\n" + "\n".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]" for n in range(1, 20))
+
+
+def test_aliases_are_read_as_what_they_stand_for() -> None:
+    assert load_yaml("a: &x [1, 2]\nb: *x\nc: [*x, *x]") == {
+        "a": [1, 2],
+        "b": [1, 2],
+        "c": [[1, 2], [1, 2]],
+    }
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -49,7 +60,7 @@ def test_values(text: str, value: Any) -> None:
         ("a: !!int x", "'x' is not an integer"),
         ("a: !!bool x", "'x' is not true or false"),
         ("a: !!python/name:os.system", "could not determine a constructor"),
-        ("[" * 5000, "nested too deeply"),
+        ("[" * 5000, "nested deeper than 50"),
     ],
 )
 def test_invalid_yaml_is_refused(text: str, said: str) -> None:

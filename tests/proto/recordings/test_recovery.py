@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
@@ -13,8 +14,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import Writer
 from processes import eventually
 
 from proto.episode import BoxLook, Episode, View
@@ -111,6 +114,143 @@ def test_a_truncated_file_keeps_the_steps_of_every_complete_chunk(
     assert not found.intact
     assert (part.steps, found.steps, found.steps_played) == (complete, complete, STEPS)
     assert recover(path).intact
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the chunks of a recording are.
+
+    Attributes:
+        spans: first byte and end of each chunk's record.
+        steps: number of steps that are complete in each.
+        messages: number of messages in each.
+    """
+
+    spans: list[tuple[int, int]]
+    steps: list[int]
+    messages: list[int]
+
+
+@pytest.fixture(scope="module")
+def layout(recording: bytes) -> Layout:
+    stream = BytesIO(recording)
+    found, channel = Layout([], [], []), None
+    for chunk in StreamReader(stream, emit_chunks=True).records:
+        if isinstance(chunk, Chunk):
+            size = 9 + 8 + 8 + 8 + 4 + 4 + len(chunk.compression) + 8 + len(chunk.data)
+            found.spans.append((stream.tell() - size, stream.tell()))
+            records = breakup_chunk(chunk)
+            for record in records:
+                if isinstance(record, Channel) and record.topic == STEP:
+                    channel = record.id
+            messages = [record for record in records if isinstance(record, Message)]
+            found.messages.append(len(messages))
+            found.steps.append(sum(message.channel_id == channel for message in messages))
+    return found
+
+
+def flips(recording: bytes, layout: Layout, count: int) -> list[int]:
+    """Bits to flip: some anywhere, most in what is small: frames, sizes, checksums, magic."""
+    random = np.random.default_rng(7)
+    ends = [at for span in layout.spans for at in span]
+    near = [at + offset for at in ends for offset in range(-9, 60)]
+    near += [*range(400), *range(len(recording) - 3000, len(recording))]
+    near = sorted({at for at in near if 0 <= at < len(recording)})
+    places = [*random.choice(near, count * 3 // 4), *random.integers(0, len(recording), count // 4)]
+    return [int(at) * 8 + int(random.integers(8)) for at in places]
+
+
+def check_flip(bit: int, recording: bytes, layout: Layout, folder: Path) -> None:
+    """A file with one flipped bit keeps all messages but those of the chunk that has the bit."""
+    at = bit // 8
+    damaged = bytearray(recording)
+    damaged[at] ^= 1 << bit % 8
+    path = folder / "flipped.mcap"
+    path.write_bytes(damaged)
+    found = recover(path, folder / "out.mcap")
+    lost = [begin <= at < end for begin, end in layout.spans]
+    kept = [not each for each in lost]
+    all_of_it = (sum(layout.messages), sum(layout.steps))  # the bit is in the times of a chunk
+    all_but_one = (sum(np.array(layout.messages)[kept]), sum(np.array(layout.steps)[kept]))
+    assert (found.messages, found.steps) in (all_of_it, all_but_one), f"bit {bit}"
+    assert recover(folder / "out.mcap").intact
+
+
+def test_one_flipped_bit_costs_at_most_the_chunk_that_has_it(
+    recording: bytes, layout: Layout, tmp_path: Path
+) -> None:
+    for bit in flips(recording, layout, 100):
+        check_flip(bit, recording, layout, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_each_of_many_flipped_bits_costs_at_most_the_chunk_that_has_it(
+    recording: bytes, layout: Layout, tmp_path: Path
+) -> None:
+    for bit in flips(recording, layout, 20_000):
+        check_flip(bit, recording, layout, tmp_path)
+
+
+def foreign_file(chunked: bool) -> bytes:
+    """An MCAP file of another program: schemas, channels, metadata and an attachment of its own."""
+    stream = BytesIO()
+    writer = Writer(stream, chunk_size=200, use_chunking=chunked)
+    writer.start("ros2", "another")
+    writer.add_attachment(1, 2, "notes.txt", "text/plain", b"hello")
+    writer.add_metadata("theirs", {"a": "b"})
+    for number in range(4):
+        schema = writer.register_schema(f"pkg/Type{number}", "ros2msg", b"float64 x")
+        writer.register_channel(f"/topic{number}", "cdr", schema, {"qos": "1"})
+    for number in range(80):
+        channel = number % 4 + 1
+        writer.add_message(channel, number, b"content %d" % number, number, number)
+    writer.finish()  # type: ignore[no-untyped-call]
+    return stream.getvalue()
+
+
+def content_of(path: Path) -> list[tuple[str, str, bytes]]:
+    with path.open("rb") as stream:
+        return [
+            (channel.topic, schema.name if schema else "", message.data)
+            for schema, channel, message in make_reader(stream).iter_messages()
+        ]
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_files_of_other_programs_are_recovered_too(tmp_path: Path, chunked: bool) -> None:
+    whole, path, out = foreign_file(chunked), tmp_path / "file.mcap", tmp_path / "out.mcap"
+    path.write_bytes(whole)
+    expected = content_of(path)
+    assert len(expected) == 80
+    assert recover(path, out).intact
+    assert content_of(out) == expected
+    kept = []
+    contents = [data for _, _, data in expected]
+    for at in range(0, len(whole), 41):
+        damaged = bytearray(whole)
+        damaged[at] ^= 0x10
+        path.write_bytes(damaged)
+        recover(path, out)
+        found = content_of(out)
+        # Outside of chunks nothing tells that a name or a content is another one.
+        right = [
+            each for each in found if each in expected or (not chunked and each[2] in contents)
+        ]
+        assert len(right) >= (80 - 12 if chunked else 80 - 2), f"byte {at}: {len(right)} are kept"
+        kept.append(len(found))
+    assert max(kept) == 80
+
+
+def test_messages_of_a_channel_that_is_lost_are_kept(tmp_path: Path) -> None:
+    """Its description is in a damaged chunk, and the file has no summary."""
+    whole, path = foreign_file(chunked=True), tmp_path / "file.mcap"
+    damaged = bytearray(whole[: whole.index(b"\x0f" + (4).to_bytes(8, "little"))])
+    damaged[whole.index(b"zstd") + 30] ^= 1
+    path.write_bytes(damaged)
+    recover(path)
+    topics = {topic for topic, _, _ in content_of(path)}
+    assert topics & {"lost/1", "lost/2", "lost/3", "lost/4"}
 
 
 def test_a_chunk_holds_few_steps(chunks: list[tuple[int, int]]) -> None:
