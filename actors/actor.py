@@ -63,6 +63,7 @@ LOG = logging.getLogger(__name__)
 
 IDLE_S: Final = 0.3
 """How long to wait before asking again, when there is nothing to play."""
+DRAIN_LOOK_S: Final = 0.1
 OUTBOX_PERIOD_S: Final = 1.0
 OUTBOX_LIMIT: Final = 100
 """An actor plays no more for a receiver that owes it so many receipts."""
@@ -153,7 +154,13 @@ class Actor:
     """
 
     def __init__(
-        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, backend: str | None = None
+        self,
+        config: Config,
+        bus: Bus,
+        lifecycle: Lifecycle,
+        *,
+        backend: str | None = None,
+        drain_s: float = 0.0,
     ) -> None:
         """Make the simulator, and find the messages that a former process with this id left.
 
@@ -162,6 +169,7 @@ class Actor:
             bus: connection to the other processes.
             lifecycle: says when to pause and to stop.
             backend: name of this actor's simulator; None for `simulator.backend`.
+            drain_s: how long it waits for receipts before it ends (s).
 
         Raises:
             UserError: the simulator cannot run on this machine, or the run's folder cannot be
@@ -170,6 +178,7 @@ class Actor:
         self._config = config
         self._bus = bus
         self._lifecycle = lifecycle
+        self._drain_s = drain_s
         self._agreement = Agreement(config, bus)
         self._joined = threading.Event()  # set when a learner or evaluator has joined
         self._task = make_task(config.task)
@@ -226,6 +235,7 @@ class Actor:
                 self._left.look()
                 while not self._lifecycle.stopping:
                     self._play_next()
+                self._wait_for_receipts()
         finally:
             self._ask_learner.close()
             self._ask_evaluator.close()
@@ -256,8 +266,21 @@ class Actor:
         return f"{self._waiting} episodes wait for their receipts on disk"
 
     @property
+    def _unanswered(self) -> int:
+        return len(self._sequences) + len(self._rollouts)
+
+    @property
     def _waiting(self) -> int:
-        return len(self._sequences) + len(self._rollouts) + len(self._left)
+        return self._unanswered + len(self._left)
+
+    def _wait_for_receipts(self) -> None:
+        """Wait until nothing of its own is in an outbox any more, or for `drain_s`."""
+        over_s = time.monotonic() + self._drain_s
+        while self._unanswered and time.monotonic() < over_s:
+            self._lifecycle.waits_for(self._missing)
+            time.sleep(DRAIN_LOOK_S)
+        if self._drain_s and self._unanswered:
+            LOG.warning("ends with %d messages without a receipt", self._unanswered)
 
     def _play_next(self) -> None:
         assignment = None

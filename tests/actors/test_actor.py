@@ -323,6 +323,22 @@ def test_receipts_of_those_who_store_nothing_delete_nothing(setup: ActorSetup) -
     setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
 
 
+def test_an_actor_whose_folder_ends_with_it_waits_for_receipts_before(setup: ActorSetup) -> None:
+    setup.gives_receipts = False
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.start_actor("--drain", "60")
+    eventually(lambda: len(setup.sequences) >= 1, "a demonstration")
+    setup.actor.terminate()
+    setup.cases.append(TutoringCase("experiment1", 6, 0))
+    before = len(setup.sequences)
+    eventually(lambda: len(setup.sequences) > before, "it is sent again")
+    assert setup.actor.poll() is None
+    setup.gives_receipts = True
+    assert setup.actor.wait(60) == 0
+    assert {episode.seed for episode in setup.sequences} == {5000}, "it plays no more"
+    assert not list(setup.outbox.rglob("*.message"))
+
+
 def test_a_killed_actor_sends_messages_without_receipt_again(setup: ActorSetup) -> None:
     setup.gives_receipts = False
     setup.cases.append(TutoringCase("experiment1", 5, 0))
