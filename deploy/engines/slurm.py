@@ -90,7 +90,7 @@ def _services(plan: Plan, services: list[Program], actors: list[Program]) -> str
 
 actors={names}
 {_handlers('"$SLURM_JOB_ID"')}
-if ((${{SLURM_RESTART_COUNT:-0}})); then  # the host may be another: actors ask for it when they start
+if ((${{SLURM_RESTART_COUNT:-0}})); then  # perhaps on another host
     squeue --noheader --user="$(id -un)" --name="$actors" --states=RUNNING --format=%A |
         xargs --no-run-if-empty --max-args=1 scontrol requeue
 fi
