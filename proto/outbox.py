@@ -24,6 +24,8 @@ RESEND_AFTER_AT_MOST_S: Final = 30.0
 IN_FLIGHT: Final = 8
 """Messages that wait for an answer at the same time; each waits for RESEND_AFTER_S at most."""
 
+_LONGEST_HEADER: Final = 4096
+
 PUT_ASIDE: Final = (".refused", ".damaged")
 """File suffixes of messages that are kept but not sent any more."""
 
@@ -38,8 +40,8 @@ class _Entry:
         path: its file.
         sends: how often it was sent.
         sent_at_s: when it was sent last (monotonic clock).
-        missing: roles whose receipts have not come; empty as long as the file was not read: then
-            any receipt is the last one.
+        missing: roles whose receipts have not come; empty if the file names none: then any receipt
+            is the last one.
     """
 
     path: Path
@@ -92,7 +94,8 @@ class Outbox:
         self._lock = threading.Lock()
         self._last_answer_s = clock()
         self._entries = {
-            path.stem.partition("-")[2]: _Entry(path) for path in sorted(folder.glob("*.message"))
+            path.stem.partition("-")[2]: _Entry(path, _receivers_of(path))
+            for path in sorted(folder.glob("*.message"))
         }
         self._put_aside = sum(path.suffix in PUT_ASIDE for path in folder.iterdir())
 
@@ -214,3 +217,13 @@ class Outbox:
         with self._lock:
             self._put_aside += 1
         LOG.warning("a message %s; it is kept in %s and not sent again", problem, aside)
+
+
+def _receivers_of(path: Path) -> set[Role]:
+    """The receivers that a file names; none if it is damaged, which is found when it is sent."""
+    try:
+        with path.open("rb") as stream:
+            header = stream.readline(_LONGEST_HEADER)
+        return {Role(role) for role in json.loads(header)["receivers"]}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return set()
