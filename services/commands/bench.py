@@ -39,7 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     bus = subjects.add_parser(
         "bus",
         help="episodes a second through hub, evaluator and learner with up to 128 light actors,"
-        " beside the same bytes without vmdnn; in less than a minute",
+        " beside the same bytes without vmdnn",
     )
     for subject in (actor, bptt, bus):
         add_config(subject)
