@@ -250,6 +250,8 @@ class _Bench:
         used = {name: _processor_s(self._pids[name]) - s for name, s in before.items()}
         raw = _Raw(self, source)
         _, raw_per_s = self._drive(raw.send, source.window, phase_s / 2)
+        if not (times and raw_per_s):
+            raise UserError(f"nothing was answered within {phase_s:g} s: this machine is too busy")
         return Flow(
             actors=len(self.sessions),
             per_s=per_s,
