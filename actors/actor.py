@@ -9,12 +9,14 @@ import time
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Final
+from zlib import crc32
 
 import numpy as np
 
 from actors.disturbances.staging import check_abilities, check_staged, stage
 from actors.inquiry import Inquiry
 from actors.left_outboxes import LOOK_EVERY_S, OUTBOXES, LeftOutboxes
+from actors.old_rollouts import divide_old_rollouts
 from actors.player import LiveStep, play
 from actors.policies.contract import Policy
 from actors.policies.guided import GuidedPolicy
@@ -30,7 +32,7 @@ from learner.policy_message import policy_limit, policy_of
 from proto.agreement import ANSWERING, Agreement
 from proto.bus import Bus
 from proto.codec import MessageError, Wire, encode
-from proto.config import Config
+from proto.config import Config, RecorderConfig
 from proto.disk_waits import when_disk_allows
 from proto.episode import Episode, Kind
 from proto.errors import UserError
@@ -41,6 +43,7 @@ from proto.messages import (
     LIVE_SCENE_EVERY,
     Correction,
     EpisodeFailed,
+    EpisodeOutcome,
     Live,
     LiveScene,
     PolicyVersion,
@@ -64,6 +67,7 @@ LOG = logging.getLogger(__name__)
 
 IDLE_S: Final = 0.3
 """How long to wait before asking again, when there is nothing to play."""
+DRAIN_LOOK_S: Final = 0.1
 OUTBOX_PERIOD_S: Final = 1.0
 OUTBOX_LIMIT: Final = 100
 """An actor plays no more for a receiver that owes it so many receipts."""
@@ -140,12 +144,29 @@ def _live_scene(live: LiveStep) -> LiveScene:
     return LiveScene(tuple(live.bodies.places), view.boxes, view.fixed_links)
 
 
+def is_recorded(episode: Episode, config: RecorderConfig) -> bool:
+    """Whether the rollout of a trial or of practice goes to recorders.
+
+    Which of the precise ones do so follows from the id: `config.share` of them.
+    """
+    if episode.kind is Kind.PRACTICE and not config.practice:
+        return False
+    return not episode.outcome.precise or crc32(episode.id.encode()) < config.share * 2**32
+
+
 class _StoppedError(Exception):
     """The episode is given up because the actor should stop."""
 
 
 class _SimulationError(Exception):
     """The episode cannot be used: the simulation gave values that cannot be."""
+
+
+def _encoded(message: object) -> Wire:
+    try:
+        return encode(message)
+    except MessageError as error:
+        raise _SimulationError(str(error)) from error
 
 
 class Actor:
@@ -156,7 +177,13 @@ class Actor:
     """
 
     def __init__(
-        self, config: Config, bus: Bus, lifecycle: Lifecycle, *, backend: str | None = None
+        self,
+        config: Config,
+        bus: Bus,
+        lifecycle: Lifecycle,
+        *,
+        backend: str | None = None,
+        drain_s: float = 0.0,
     ) -> None:
         """Make the simulator, and find the messages that a former process with this id left.
 
@@ -165,6 +192,7 @@ class Actor:
             bus: connection to the other processes.
             lifecycle: says when to pause and to stop.
             backend: name of this actor's simulator; None for `simulator.backend`.
+            drain_s: how long it waits for receipts before it ends (s).
 
         Raises:
             UserError: the simulator cannot run on this machine, or the run's folder cannot be
@@ -173,6 +201,7 @@ class Actor:
         self._config = config
         self._bus = bus
         self._lifecycle = lifecycle
+        self._drain_s = drain_s
         self._agreement = Agreement(config, bus)
         self._joined = threading.Event()  # set when a learner or evaluator has joined
         self._task = make_task(config.task)
@@ -183,9 +212,9 @@ class Actor:
         self._simulator = make_simulator(config.simulator.model_copy(update=chosen))
         self._player = player_of(self._simulator)
         folder = config.run_folder / "outbox" / bus.id
-        self._sequences, self._rollouts = (
-            Outbox(folder / each, self._deliver) for each in OUTBOXES
-        )
+        divide_old_rollouts(folder)
+        self._outboxes = tuple(Outbox(folder / each, self._deliver) for each in OUTBOXES)
+        self._sequences, self._rollouts, self._outcomes = self._outboxes
         self._receipts = Receipts(bus)
         self._left = LeftOutboxes(config.run_folder, bus, self._receipts)
         keys = bus.keys
@@ -216,8 +245,7 @@ class Actor:
         for role in ANSWERING:
             self._bus.watch_presence(role, self._on_presence)
         self._agreement.check()
-        outboxes = (self._sequences, self._rollouts)
-        self._receipts.pass_on(self._bus.id, lambda: outboxes)
+        self._receipts.pass_on(self._bus.id, lambda: self._outboxes)
         self._bus.subscribe_newest(
             keys.policy,
             self._on_policy,
@@ -229,12 +257,14 @@ class Actor:
                 membership(self._bus, self, self._lifecycle),
                 every(OUTBOX_PERIOD_S, self._sequences.send_due),
                 every(OUTBOX_PERIOD_S, self._rollouts.send_due),
+                every(OUTBOX_PERIOD_S, self._outcomes.send_due),
                 every(LOOK_EVERY_S, self._left.look),
             ):
                 self._left.look()
                 self._report_deaths()
                 while not self._lifecycle.stopping:
                     self._play_next()
+                self._wait_for_receipts()
         finally:
             self._ask_learner.close()
             self._ask_evaluator.close()
@@ -255,7 +285,7 @@ class Actor:
             last_kind=last.kind if last else None,
             backend=self._simulator.name,
             outbox=self._waiting,
-            put_aside=self._sequences.put_aside + self._rollouts.put_aside,
+            put_aside=sum(each.put_aside for each in self._outboxes),
             failed=self._failed,
             paused=self._lifecycle.paused,
         )
@@ -265,8 +295,26 @@ class Actor:
         return f"{self._waiting} episodes wait for their receipts on disk"
 
     @property
+    def _behind(self) -> int:
+        """Episodes of its policy for which evaluator or recorder owe a receipt."""
+        return max(len(self._rollouts), len(self._outcomes))
+
+    @property
+    def _unanswered(self) -> int:
+        return sum(map(len, self._outboxes))
+
+    @property
     def _waiting(self) -> int:
-        return len(self._sequences) + len(self._rollouts) + len(self._left)
+        return self._unanswered + len(self._left)
+
+    def _wait_for_receipts(self) -> None:
+        """Wait until nothing of its own is in an outbox any more, or for `drain_s`."""
+        over_s = time.monotonic() + self._drain_s
+        while self._unanswered and time.monotonic() < over_s:
+            self._lifecycle.waits_for(self._missing)
+            time.sleep(DRAIN_LOOK_S)
+        if self._drain_s and self._unanswered:
+            LOG.warning("ends with %d messages without a receipt", self._unanswered)
 
     def _report_deaths(self) -> None:
         """Send what killed the former process; play nothing before it is known, or it kills again.
@@ -274,9 +322,9 @@ class Actor:
         Whoever does not answer is not waited for.
         """
         over_s = time.monotonic() + REPORT_WITHIN_S
-        while (deaths := self._sequences.of_dead + self._rollouts.of_dead) > 0:
-            self._sequences.send_due()
-            self._rollouts.send_due()
+        while deaths := sum(outbox.of_dead for outbox in self._outboxes):
+            for outbox in self._outboxes:
+                outbox.send_due()
             if self._lifecycle.stopping or time.monotonic() > over_s:
                 return
             self._lifecycle.waits_for(f"receipts for {deaths} reports of the former process")
@@ -337,7 +385,7 @@ class Actor:
         ]
         if silent:
             return f"an answer of the {' and the '.join(silent)}"
-        if missing := sorted(self._sequences.missing | self._rollouts.missing):
+        if missing := sorted(set().union(*(each.missing for each in self._outboxes))):
             return f"receipts of the {' and the '.join(missing)}"
         return "something to play" if self._policy else "something to play, or a policy"
 
@@ -404,7 +452,7 @@ class Actor:
 
     def _trial(self) -> Assignment | None:
         """A trial of this policy that the evaluator asks for; None if there is none."""
-        if self._policy is None or len(self._rollouts) >= OUTBOX_LIMIT:
+        if self._policy is None or self._behind >= OUTBOX_LIMIT:
             return None
         version, digest = self._policy.version, self._agreement.digest
         request = TrialRequest(self._bus.id, self._policy_run, version, digest, self._player)
@@ -422,7 +470,7 @@ class Actor:
         """
         if self._policy is None or not self._config.actor.practice:
             return None
-        if len(self._rollouts) >= PRACTICE_LIMIT:
+        if self._behind >= PRACTICE_LIMIT:
             return None
         drawn = [
             (seed, suite.conditions(seed))
@@ -512,23 +560,24 @@ class Actor:
             _SimulationError: its values are not those of an episode, such as NaN.
             StorageError: the actor should stop, and it cannot be written to disk.
         """
-        learned_from = episode.kind in (Kind.TUTORING, Kind.CORRECTION)
         keys, actor = self._bus.keys, self._bus.id
-        try:
-            if learned_from:
-                wire = encode(Sequence(episode))
-            else:
-                wire = encode(Rollout(episode, episode.training))
-        except MessageError as error:
-            raise _SimulationError(str(error)) from error
-        if learned_from:
-            outbox, key, receivers = self._sequences, keys.sequence(actor), [Role.LEARNER]
-        else:
-            outbox, key, receivers = self._rollouts, keys.rollout(actor), [Role.EVALUATOR]
-            recorder = self._config.recorder
-            if recorder.required and (recorder.practice or episode.kind is Kind.TRIAL):
-                receivers.append(Role.RECORDER)
-        when_disk_allows(self._lifecycle, lambda: outbox.add(episode.id, key, wire, receivers))
+        if episode.kind in (Kind.TUTORING, Kind.CORRECTION):
+            sequence = _encoded(Sequence(episode))
+            self._keep(self._sequences, episode, keys.sequence(actor), sequence, Role.LEARNER)
+            return
+        rollout = _encoded(Rollout(episode, episode.training))
+        outcome = _encoded(EpisodeOutcome.of(episode))
+        # The rollout first: whatever is counted has its recording.
+        if is_recorded(episode, self._config.recorder):
+            key = keys.rollout(actor)
+            if self._config.recorder.required:
+                self._keep(self._rollouts, episode, key, rollout, Role.RECORDER)
+            elif self._bus.watched(key):
+                self._bus.publish(key, Rollout(episode, episode.training), check=False)
+        self._keep(self._outcomes, episode, keys.outcome(actor), outcome, Role.EVALUATOR)
+
+    def _keep(self, outbox: Outbox, episode: Episode, key: str, wire: Wire, receiver: Role) -> None:
+        when_disk_allows(self._lifecycle, lambda: outbox.add(episode.id, key, wire, [receiver]))
 
     def _report_failure(self, failed: Assignment, problem: str) -> None:
         """Tell the process that asked for the episode; nobody asks for practice."""
@@ -567,7 +616,7 @@ class Actor:
     def _outbox_of(self, kind: Kind) -> tuple[Outbox, Role]:
         """The outbox of reports about episodes of a kind, and who receives them."""
         if kind is Kind.TRIAL:
-            return self._rollouts, Role.EVALUATOR
+            return self._outcomes, Role.EVALUATOR
         return self._sequences, Role.LEARNER
 
     def _on_policy(self, message: PolicyVersion) -> None:

@@ -110,7 +110,7 @@ def bench_actor(config: Config) -> ActorSpeed:
     with closing(make_simulator(config.simulator)) as simulator:
         runner = _EpisodeRunner(simulator, task, situation)
         tutor = make_tutor(task)
-        checkpoint = _random_checkpoint(config.network)
+        checkpoint = random_checkpoint(config.network)
         policy = _TimedNetworkPolicy(
             NetworkPolicy(checkpoint, "the benchmark"), task.plan(situation)
         )
@@ -291,7 +291,7 @@ class _NetworkVariants:
             self._parts.act(seen)
 
 
-def _random_checkpoint(config: NetworkConfig) -> Checkpoint:
+def random_checkpoint(config: NetworkConfig) -> Checkpoint:
     """A network of the configured sizes with random weights."""
     rng = np.random.default_rng(0)
     tensors = {

@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
 
+from actors.old_rollouts import divide_old_rollouts
 from actors.receipts import Receipts
 from proto.bus import Bus
 from proto.errors import UserError
@@ -21,7 +22,7 @@ LOG = logging.getLogger(__name__)
 LOOK_EVERY_S: Final = 30.0
 GONE_AFTER_S: Final = 60.0
 """An actor that was away for so long is gone for good; one that is restarted is back before."""
-OUTBOXES: Final = ("sequences", "rollouts")
+OUTBOXES: Final = ("sequences", "rollouts", "outcomes")
 
 
 class LeftOutboxes:
@@ -84,6 +85,7 @@ class LeftOutboxes:
         try:
             lock.enter_context(only_one(self._run_folder, Role.WATCH, f"left-{name}"))
             with only_one(self._run_folder, Role.ACTOR, name):
+                divide_old_rollouts(folder)
                 outboxes = [Outbox(folder / each, self._send_as(name)) for each in OUTBOXES]
         except UserError:  # its process runs on this machine, or another actor sends them
             lock.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -14,14 +13,8 @@ from typing import Final
 
 from rich.console import Console
 
-from deploy.supervision import (
-    BAD_INPUT,
-    ProcessFailedError,
-    Program,
-    Supervisor,
-    SupervisorEndedError,
-    Watchdog,
-)
+from deploy.processes import BAD_INPUT, programs
+from deploy.supervision import ProcessFailedError, Supervisor, SupervisorEndedError, Watchdog
 from proto.bus import Bus, NoHubError, open_bus
 from proto.config import Config, load_config
 from proto.errors import UserError
@@ -42,7 +35,6 @@ from services.terminal.display import display
 from services.terminal.run_words import success_words
 
 DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
-VMDNN: Final = str(Path(sys.executable).with_name("vmdnn"))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -188,37 +180,6 @@ def _run(config: Config, actors: Mapping[str, int], console: Console) -> None:
         console.print(text, highlight=False, soft_wrap=True)
 
 
-def programs(config: Config, file: Path, actors: Mapping[str, int]) -> list[Program]:
-    """Return the programs of a run, in the order in which they are started.
-
-    Args:
-        config: the configuration of the run.
-        file: its file.
-        actors: number of actors by simulator.
-    """
-
-    def vmdnn(role: Role) -> tuple[str, ...]:
-        return (VMDNN, role.value, "--config", str(file))
-
-    started = [
-        Program("hub", vmdnn(Role.HUB)),
-        Program(
-            "learner",
-            vmdnn(Role.LEARNER),
-            threads=config.learner.threads,
-            stop_within_s=30,  # it saves a checkpoint
-        ),
-        Program("evaluator", vmdnn(Role.EVALUATOR)),
-        Program("recorder", vmdnn(Role.RECORDER)),
-    ]
-    present = {backend: number for backend, number in actors.items() if number}
-    for backend, number in present.items():
-        chosen = () if backend == config.simulator.backend else ("--backend", backend)
-        name = "actor" if len(present) == 1 else f"actor-{re.sub('[^A-Za-z0-9]+', '-', backend)}"
-        started.append(Program(name, (*vmdnn(Role.ACTOR), *chosen), processes=number))
-    return started
-
-
 def is_done(view: RunView) -> bool:
     """Return whether learner and evaluator report that the run is done."""
     learners = view.living(LearnerMetrics)
@@ -262,7 +223,7 @@ def _follow(board: Board, watchdog: Watchdog, lifecycle: Lifecycle, console: Con
         while True:
             view = board.view()
             show(view)
-            watchdog.look()
+            watchdog.look_unless_stopping(lifecycle)
             if lifecycle.stopping or is_done(view):
                 return view
             lifecycle.wait(METRICS_PERIOD_S)
@@ -271,7 +232,7 @@ def _follow(board: Board, watchdog: Watchdog, lifecycle: Lifecycle, console: Con
 def _connect(config: Config, watchdog: Watchdog, lifecycle: Lifecycle) -> Bus | None:
     """Connect to the hub, which has been started; None if this process was asked to stop."""
     while not lifecycle.stopping:
-        watchdog.look()
+        watchdog.look_unless_stopping(lifecycle)
         try:
             return open_bus(config.hub, config.run.name, Role.WATCH, f"run-local-{os.getpid()}")
         except NoHubError:
@@ -315,7 +276,7 @@ def _score_lines(suite: SuiteScore) -> list[str]:
     ]
 
 
-def _actors(text: str) -> Mapping[str, int] | int:
+def parse_actors(text: str) -> Mapping[str, int] | int:
     """Parse a number of actors, or numbers by simulator such as `sapien=1,mujoco=1`."""
     number = integer(0)
     if "=" not in text:
@@ -334,7 +295,7 @@ def _actors(text: str) -> Mapping[str, int] | int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="run_local", add_help=False)  # run_local.sh prints it
     parser.add_argument("--config", type=config_argument, default=DEFAULT_CONFIG)
-    parser.add_argument("--actors", type=_actors)
+    parser.add_argument("--actors", type=parse_actors)
     parser.add_argument("--backend")
     parser.add_argument("--set", dest="overrides", action="append", default=[])
     return parser

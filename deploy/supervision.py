@@ -23,50 +23,32 @@ from types import TracebackType
 from typing import Any, Final, Self
 from xmlrpc.client import Fault, ServerProxy
 
-from supervisor.xmlrpc import SupervisorTransport
+from supervisor.xmlrpc import Faults, SupervisorTransport
 
+from deploy.processes import (
+    BAD_INPUT,
+    FIRST_BEAT_WITHIN_S,
+    STOP_SIGNAL,
+    STUCK_AFTER_S,
+    Program,
+)
 from proto.errors import UserError
+from proto.lifecycle import Lifecycle
 from proto.storage import written_whole
 from services.arguments.process import HEARTBEAT_FILE
 
 START_WITHIN_S: Final = 20.0
 ANSWER_WITHIN_S: Final = 10.0
 """Time in which supervisord must answer a request."""
-STUCK_AFTER_S: Final = 60.0
-"""A process without a heartbeat for this time is killed."""
-FIRST_BEAT_WITHIN_S: Final = 300.0
-"""A process that starts on a busy machine needs time until its first heartbeat."""
 WELL_AFTER_S: Final = 60.0
 """A process that has run for this time is started again at once when it ends."""
 LONGEST_DELAY_S: Final = 30.0
 _LATE_S: Final = 30.0
 _SOCKET_PATH_BYTES: Final = 100
-BAD_INPUT: Final = 2
-"""Exit status for bad input; a process that ends with it is not started again."""
 
 # The kernel sends SIGTERM to a process when its parent dies for any reason. All processes therefore
 # end when the script is killed.
-_DIES_WITH_PARENT: Final = ("setpriv", "--pdeathsig", "TERM", "--")
-
-
-@dataclass(frozen=True)
-class Program:
-    """Processes that run the same command.
-
-    Attributes:
-        name: name of the process; several processes are called `name-1`, `name-2` and so on.
-        command: the command with its arguments.
-        threads: number of threads with which each process computes. More threads than cores slow
-            all processes down.
-        processes: number of processes.
-        stop_within_s: time from SIGTERM to SIGKILL.
-    """
-
-    name: str
-    command: Sequence[str]
-    threads: int = 1
-    processes: int = 1
-    stop_within_s: int = 15
+_DIES_WITH_PARENT: Final = ("setpriv", "--pdeathsig", STOP_SIGNAL, "--")
 
 
 @dataclass(frozen=True)
@@ -244,6 +226,10 @@ class Supervisor:
         try:
             with ServerProxy("http://supervisord", transport) as supervisord:
                 return getattr(supervisord.supervisor, method)(*arguments)
+        except Fault as error:
+            if error.faultCode != Faults.SHUTDOWN_STATE:
+                raise
+            raise SupervisorEndedError("supervisord was told to stop its processes") from error
         except (OSError, HTTPException) as error:
             if self._process is None or self._process.poll() is None:
                 raise
@@ -347,6 +333,14 @@ class Watchdog:
                 raise SupervisorEndedError(f"supervisord does not answer ({error})") from error
         else:
             self._answered_at_s = now_s
+
+    def look_unless_stopping(self, lifecycle: Lifecycle) -> None:
+        """`look`; but whoever stops this process may have stopped supervisord as well."""
+        try:
+            self.look()
+        except SupervisorEndedError:
+            if not lifecycle.stopping:
+                raise
 
     def _look_at(self, process: ProcessState, now_s: float) -> None:
         if process.cannot_work:
@@ -454,7 +448,7 @@ environment=OMP_NUM_THREADS="{program.threads}",{HEARTBEAT_FILE}="{_plain(heartb
 autostart=false
 autorestart=false
 startsecs=0
-stopsignal=TERM
+stopsignal={STOP_SIGNAL}
 stopwaitsecs={program.stop_within_s}
 killasgroup=true
 redirect_stderr=true

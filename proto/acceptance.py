@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from proto.body import ACTION_VALUES
 from proto.episode import LARGEST_DEG, Floats
 from proto.errors import UserError
+from proto.messages import EpisodeOutcome
 from proto.situations import DrawnTask, variables_of
 from proto.suites import Conditions
 from proto.variables import Situation, check_situation
@@ -79,12 +80,33 @@ def misfit(episode: Played, task: PlayedTask, control_period_s: float) -> str:
     )
 
 
+def outcome_misfit(played: EpisodeOutcome, task: PlayedTask, control_period_s: float) -> str:
+    """Return why the outcome is of no episode of a task; empty if it is of one. As `misfit`."""
+    return (
+        _situation_misfit(played, task)
+        or _period_misfit(played.control_period_s, control_period_s)
+        or _steps_misfit(played.steps, task)
+    )
+
+
+def _period_misfit(period_s: float, control_period_s: float) -> str:
+    if math.isclose(period_s, control_period_s, rel_tol=1e-6):
+        return ""
+    return f"its control steps take {period_s} s, not {control_period_s} s"
+
+
+def _steps_misfit(steps: int, task: PlayedTask) -> str:
+    if steps == len(task.phases):
+        return ""
+    return f"it has {steps} steps; an episode of {task.name} has {len(task.phases)}"
+
+
 def _shape_misfit(episode: Played, task: PlayedTask, control_period_s: float) -> str:
-    if not math.isclose(episode.control_period_s, control_period_s, rel_tol=1e-6):
-        return f"its control steps take {episode.control_period_s} s, not {control_period_s} s"
-    steps = len(episode.phases)
-    if steps != len(task.phases):
-        return f"it has {steps} steps; an episode of {task.name} has {len(task.phases)}"
+    problem = _period_misfit(episode.control_period_s, control_period_s) or _steps_misfit(
+        len(episode.phases), task
+    )
+    if problem:
+        return problem
     if not np.array_equal(episode.phases, task.phases):  # older files name the phases otherwise
         return f"its phases are not those of {task.name}"
     return ""
@@ -100,7 +122,7 @@ def _values_misfit(episode: Played) -> str:
     return ""
 
 
-def _situation_misfit(episode: Played, task: PlayedTask) -> str:
+def _situation_misfit(episode: Played | EpisodeOutcome, task: PlayedTask) -> str:
     try:
         check_situation(episode.situation, variables_of(task, episode.conditions), task.name)
     except UserError as error:

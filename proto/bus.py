@@ -280,6 +280,18 @@ class Bus:
         """Publish an encoded message; waits while the link is full."""
         self._put(key, wire, zenoh.CongestionControl.BLOCK)
 
+    def put_raw(self, key: str, payload: bytes) -> None:
+        """Publish bytes as they are, without what makes them a message; for benchmarks."""
+        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+    def subscribe_raw(self, key: str, callback: Callable[[str, bytes], None]) -> None:
+        """Call `callback` with key and bytes of whatever is published; for benchmarks."""
+        self._declared.append(
+            self._session.declare_subscriber(
+                key, lambda sample: callback(str(sample.key_expr), sample.payload.to_bytes())
+            )
+        )
+
     def publish_newest(self, key: str, message: Any) -> None:
         """Publish a message that later subscribers get as well, as long as this process lives."""
         if key not in self._newest:

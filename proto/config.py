@@ -564,11 +564,13 @@ class RecorderConfig(_Section):
         required: actors keep a rollout until the recorder has it too. False for a run without a
             recorder.
         practice: record episodes of practice too, not only trials.
+        share: share of the precise episodes that are recorded; all others always are.
         keep: how many recordings are kept.
     """
 
     required: Switch = True
     practice: Switch = True
+    share: Annotated[float, Field(strict=True, ge=0, le=1)] = 1.0
     keep: KeepConfig = KeepConfig()
 
 

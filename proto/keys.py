@@ -79,8 +79,12 @@ class Keys:
         return f"vmdnn/{self.run}/sequence/{actor}"
 
     def rollout(self, actor: str = ANYONE) -> str:
-        """Actor to evaluator and recorder: `Rollout`."""
+        """Actor to recorders: `Rollout`."""
         return f"vmdnn/{self.run}/rollout/{actor}"
+
+    def outcome(self, actor: str = ANYONE) -> str:
+        """Actor to evaluator: `EpisodeOutcome`."""
+        return f"vmdnn/{self.run}/outcome/{actor}"
 
     def failure(self, actor: str = ANYONE) -> str:
         """Actor to learner and evaluator: `EpisodeFailed`."""
@@ -94,10 +98,10 @@ class Keys:
         """The key of this run under which an actor publishes what it kept under another run's name.
 
         Raises:
-            ValueError: it is not the key of a sequence, a rollout or a failure.
+            ValueError: it is not the key of a sequence, a rollout, an outcome or a failure.
         """
         channel = key.split("/")[-2:-1]
-        if channel not in (["sequence"], ["rollout"], ["failure"]):
+        if channel not in (["sequence"], ["rollout"], ["outcome"], ["failure"]):
             raise ValueError(f"nothing is sent under the key {key!r}")
         return f"vmdnn/{self.run}/{channel[0]}/{actor}"
 

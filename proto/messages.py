@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 
 from proto.body import ACTION_SIZE, IMAGE_HEIGHT, IMAGE_WIDTH
 from proto.codec import (
@@ -93,7 +93,7 @@ class Sequence:
 @message("rollout", 3, limit=EPISODE_LIMIT)
 @dataclass(frozen=True)
 class Rollout:
-    """An episode that a network played as a trial or in practice, from an actor to the evaluator.
+    """An episode that a network played as a trial or in practice, from an actor to recorders.
 
     Attributes:
         episode: the episode.
@@ -102,6 +102,60 @@ class Rollout:
 
     episode: Episode
     run_id: Id
+
+
+@message("episode_outcome", 1)
+@dataclass(frozen=True)
+class EpisodeOutcome:
+    """How a trial or an episode of practice ended, from an actor to the evaluator.
+
+    It is all that is counted: the pictures and movements are in the `Rollout` of the same id.
+
+    Attributes:
+        id, actor, kind, task, situation, seed, backend, policy_version, config_digest,
+            control_period_s, training, conditions, outcome: as in `Episode`.
+        steps: number of control steps.
+    """
+
+    id: Id
+    actor: Id
+    kind: Kind
+    task: str
+    situation: SituationField
+    seed: Seed
+    backend: str
+    policy_version: Count
+    config_digest: str
+    steps: Count
+    control_period_s: Annotated[float, Number(1e-6, 1e3)]
+    training: Id
+    outcome: Outcome
+    conditions: ConditionsField = None
+
+    @property
+    def suite(self) -> str:
+        """Name of the suite that the episode belongs to."""
+        return suite_of(self.conditions)
+
+    @classmethod
+    def of(cls, episode: Episode) -> Self:
+        """The outcome of an episode."""
+        return cls(
+            id=episode.id,
+            actor=episode.actor,
+            kind=episode.kind,
+            task=episode.task,
+            situation=episode.situation,
+            seed=episode.seed,
+            backend=episode.backend,
+            policy_version=episode.policy_version,
+            config_digest=episode.config_digest,
+            steps=episode.steps,
+            control_period_s=episode.control_period_s,
+            training=episode.training,
+            outcome=episode.outcome,
+            conditions=episode.conditions,
+        )
 
 
 @message("episode_failed", 2)

@@ -58,8 +58,8 @@ class _Entry:
         path: its file.
         sends: how often it was sent.
         sent_at_s: when it was sent last (monotonic clock).
-        missing: roles whose receipts have not come; empty as long as the file was not read: then
-            any receipt is the last one.
+        missing: roles whose receipts have not come; empty if the file names none: then any receipt
+            is the last one.
     """
 
     path: Path
@@ -118,7 +118,7 @@ class Outbox:
         self._lock = threading.Lock()
         self._last_answer_s = clock()
         messages = dict.fromkeys((*died, *sorted(folder.glob("*.message"))))
-        self._entries = {_name_of(path): _Entry(path) for path in messages}
+        self._entries = {_name_of(path): _Entry(path, _receivers_of(path)) for path in messages}
         self._of_dead = frozenset(map(_name_of, died))
         self._put_aside = sum(path.suffix in PUT_ASIDE for path in folder.iterdir())
 
@@ -311,3 +311,13 @@ def _read_message(path: Path) -> tuple[str, set[Role], Wire]:
     if values.get("sha256", digest) != digest:  # older files have no digest
         raise ValueError("its content differs from its digest")
     return key, {Role(role) for role in receivers}, Wire(encoding, payload)
+
+
+def _receivers_of(path: Path) -> set[Role]:
+    """The receivers that a file names; none if it is damaged, which is found when it is sent."""
+    try:
+        with path.open("rb") as stream:
+            header = stream.readline(_LARGEST_HEADER)
+        return {Role(role) for role in json.loads(header)["receivers"]}
+    except (OSError, *_DAMAGE):
+        return set()

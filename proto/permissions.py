@@ -113,7 +113,8 @@ def _rows() -> Iterator[Row]:
         (readers, (subscribe, query, presence)),
     )
     yield _row(keys.sequence(ACTOR_ID), (actor, (put,)), (learner, (subscribe,)))
-    yield _row(keys.rollout(ACTOR_ID), (actor, (put,)), ((evaluator, recorder), (subscribe,)))
+    yield _row(keys.outcome(ACTOR_ID), (actor, (put,)), (evaluator, (subscribe,)))
+    yield _row(keys.rollout(ACTOR_ID), (actor, (put,)), (recorder, (subscribe,)))
     yield _row(keys.failure(ACTOR_ID), (actor, (put,)), ((learner, evaluator), (subscribe,)))
     for role in _RECEIVERS:
         yield _row(keys.receipt(role, ACTOR_ID), (HOLDER_OF[role], (put,)), (actor, (subscribe,)))

@@ -13,7 +13,16 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from proto.keys import Role
-from proto.messages import EpisodeFailed, Live, PolicyVersion, Receipt, Rollout, Sequence, Verdict
+from proto.messages import (
+    EpisodeFailed,
+    EpisodeOutcome,
+    Live,
+    PolicyVersion,
+    Receipt,
+    Rollout,
+    Sequence,
+    Verdict,
+)
 from proto.metrics import Metrics
 
 _ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -74,7 +83,7 @@ def _owner(message: object) -> str:
     match message:
         case Sequence(episode) | Rollout(episode):
             return episode.actor
-        case EpisodeFailed() | Live():
+        case EpisodeFailed() | EpisodeOutcome() | Live():
             return message.actor
         case Metrics():
             return f"{message.role}/{message.id}"

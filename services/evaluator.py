@@ -12,13 +12,13 @@ from actors.disturbances.staging import check_suite
 from actors.tasks.contract import Task
 from learner.policy_message import policy_limit, policy_of
 from learner.tutoring.failures import Failures
-from proto.acceptance import misfit, same_situation
+from proto.acceptance import outcome_misfit, same_situation
 from proto.agreement import OTHER_SETTINGS, Agreement
-from proto.bus import Bus
+from proto.bus import Bus, Inbox
 from proto.config import Config
 from proto.disk_waits import when_disk_allows
 from proto.disturbances import DISTURBANCES, Ability
-from proto.episode import Episode, Kind, Outcome
+from proto.episode import Kind, Outcome
 from proto.errors import UserError
 from proto.keys import Role
 from proto.leases import Leases
@@ -26,10 +26,10 @@ from proto.lifecycle import Lifecycle
 from proto.membership import alone_in_run, membership
 from proto.messages import (
     EpisodeFailed,
+    EpisodeOutcome,
     PolicyKey,
     PolicyVersion,
     Receipt,
-    Rollout,
     Trial,
     TrialRequest,
     Verdict,
@@ -46,10 +46,14 @@ from services.trials.trial_log import TrialLog
 
 LOG = logging.getLogger(__name__)
 
+OUTCOMES_WAITING: Final = 4096
+"""Outcomes that may wait to be handled; more are dropped, and sent again by their actors."""
 WAITING: Final = 64
-"""Messages that may wait to be handled; more are dropped, and sent again by their actors."""
+"""The same for reports of failed simulations."""
+AT_ONCE: Final = 256
+"""Trials that are written to disk together."""
 IDLE_S: Final = 0.5
-"""How often to look whether it should stop, while no rollout arrives."""
+"""How often to look whether it should stop, while no outcome arrives."""
 VERSIONS_TOLD: Final = 500
 """The metrics have the scores of so many of the newest versions; the log has all."""
 REASONS_TOLD: Final = 31
@@ -89,6 +93,7 @@ class Evaluator:
         self._players = Players()
         self._unplayable: dict[str, str] = {}
         self._failures: Failures[TrialKey] = Failures()
+        self._taken: list[EpisodeOutcome] = []  # to be counted and answered
         self._task = task
         self._agreement = Agreement(config, bus)
         self._folder = config.run_folder / "evaluation"
@@ -111,7 +116,7 @@ class Evaluator:
         self._agreement.answer()
         make_folder(self._folder)  # shows the next process that there was one before
         keys = self._bus.keys
-        rollouts = self._bus.inbox(keys.rollout(), Rollout, capacity=WAITING)
+        outcomes = self._bus.inbox(keys.outcome(), EpisodeOutcome, capacity=OUTCOMES_WAITING)
         failures = self._bus.inbox(keys.failure(), EpisodeFailed, capacity=WAITING)
         self._bus.subscribe_newest(
             keys.policy,
@@ -122,12 +127,15 @@ class Evaluator:
         self._bus.answer(keys.request_trial, TrialRequest, self._hand_out)
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
         with membership(self._bus, self, self._lifecycle):
+            look_at_s = 0.0
             while not self._lifecycle.stopping:
-                came = rollouts.handle(self._on_rollout, timeout_s=IDLE_S)
+                came = self._receive(outcomes)
                 self._lifecycle.waits_for("" if came else self._waited_for)
                 while failures.handle(self._on_failure):
                     pass
-                self._look_for_players()
+                if not came or time.monotonic() >= look_at_s:
+                    self._look_for_players()
+                    look_at_s = time.monotonic() + IDLE_S
 
     def metrics(self) -> EvaluatorMetrics:
         """Metrics at this moment."""
@@ -241,21 +249,37 @@ class Evaluator:
                 return f"no actor with {suite.backend} can play the disturbance {name}"
         return ""
 
-    def _on_rollout(self, rollout: Rollout) -> None:
-        episode = rollout.episode
+    def _receive(self, inbox: Inbox[EpisodeOutcome]) -> bool:
+        """Handle the outcomes that have arrived; False if none arrives for some time.
+
+        All trials among them are written to disk at once, which takes as long as for one.
+        """
+        came = inbox.handle(self._on_outcome, timeout_s=IDLE_S)
+        while len(self._taken) < AT_ONCE and inbox.handle(self._on_outcome):
+            pass
+        taken, self._taken = self._taken, []
+        trials = [played for played in taken if played.kind is Kind.TRIAL]
+        for played in when_disk_allows(self._lifecycle, lambda: self._log.add_outcomes(trials)):
+            _report_trial(played, played.outcome.reason)
+        for played in trials:
+            policy = (played.training, played.policy_version)
+            self._leases.finish((policy, played.suite, played.seed))
+        for played in taken:  # a trial that was counted before gets its receipt again
+            self._answer(played.actor, Receipt(played.id))
+        return came
+
+    def _on_outcome(self, played: EpisodeOutcome) -> None:
         try:
-            refusal = self._refusal(episode) or self._misfit(rollout)
+            refusal = self._refusal(played) or self._misfit(played)
         except NotYetError:  # without a receipt the actor sends it again
             return
-        if not refusal and episode.kind is Kind.TRIAL:
-            policy = (rollout.run_id, episode.policy_version)
-            self._leases.finish((policy, episode.suite, episode.seed))
-            if when_disk_allows(self._lifecycle, lambda: self._log.add(rollout)):
-                _report_trial(episode, episode.outcome.reason)
-        elif not refusal:
-            self._bus.deliver(self._bus.keys.verdict, _verdict(rollout))
-        # A trial that was counted before gets its receipt again.
-        self._answer(episode.actor, Receipt(episode.id, self._told(episode.actor, refusal)))
+        if refusal:
+            receipt = Receipt(played.id, self._told(played.actor, refusal))
+            self._answer(played.actor, receipt)
+            return
+        if played.kind is Kind.PRACTICE:
+            self._bus.deliver(self._bus.keys.verdict, _verdict(played))
+        self._taken.append(played)
 
     def _on_failure(self, report: EpisodeFailed) -> None:
         if report.kind is not Kind.TRIAL:  # the learner answers it
@@ -285,7 +309,7 @@ class Evaluator:
 
     @property
     def _waited_for(self) -> str:
-        """What it waits for while no rollout arrives."""
+        """What it waits for while no outcome arrives."""
         if self._bus.hub_is_away:
             return "the hub"
         _, version = newest = self._asked.newest
@@ -294,7 +318,7 @@ class Evaluator:
         left = sum(len(self._missing(newest, suite)) for suite in self._suites.values())
         return f"{left} trials of policy {version}" if left else "the next policy"
 
-    def _refusal(self, played: Episode | EpisodeFailed) -> str:
+    def _refusal(self, played: EpisodeOutcome | EpisodeFailed) -> str:
         """Why an episode is no trial and no practice of this run; empty if it is one.
 
         Raises:
@@ -313,7 +337,7 @@ class Evaluator:
             or self._asked_problem(played, suite)
         )
 
-    def _seed_problem(self, played: Episode | EpisodeFailed, suite: Suite) -> str:
+    def _seed_problem(self, played: EpisodeOutcome | EpisodeFailed, suite: Suite) -> str:
         """Why an episode cannot have its seed; empty if it can."""
         seed = played.seed
         if played.kind is Kind.TRIAL:
@@ -323,18 +347,18 @@ class Evaluator:
             return f"the situation with the seed {seed} is one of trials, not of practice"
         return "" if seed in suite.practice_seeds else f"the seed {seed} is none of practice"
 
-    def _conditions_problem(self, played: Episode | EpisodeFailed, suite: Suite) -> str:
+    def _conditions_problem(self, played: EpisodeOutcome | EpisodeFailed, suite: Suite) -> str:
         """Why an episode is not what its seed stands for in a suite; empty if it is."""
         conditions = suite.conditions(played.seed)
         if played.conditions != conditions:
             return f"the suite {suite.name} asks for other conditions with the seed {played.seed}"
-        if isinstance(played, Episode) and played.backend != suite.backend:
+        if isinstance(played, EpisodeOutcome) and played.backend != suite.backend:
             return f"the suite {suite.name} is played in {suite.backend}, not in {played.backend}"
         if not same_situation(played.situation, situation_of(self._task, conditions, played.seed)):
             return f"its situation is not the one of the seed {played.seed}"
         return ""
 
-    def _asked_problem(self, played: Episode | EpisodeFailed, suite: Suite) -> str:
+    def _asked_problem(self, played: EpisodeOutcome | EpisodeFailed, suite: Suite) -> str:
         """Why an episode was not asked for; empty if it was, or was counted before."""
         policy = (played.training, played.policy_version)
         problem = self._asked.policy_problem(policy)
@@ -344,13 +368,11 @@ class Evaluator:
             return ""
         return self._asked.trial_problem(policy, (suite.name, played.seed), played.actor)
 
-    def _misfit(self, rollout: Rollout) -> str:
+    def _misfit(self, played: EpisodeOutcome) -> str:
         """Why an episode does not fit the configuration of this run; empty if it does."""
-        if rollout.run_id != rollout.episode.training:
-            return "it names two trainings"
-        if rollout.episode.config_digest != self._agreement.digest:
+        if played.config_digest != self._agreement.digest:
             return OTHER_SETTINGS
-        return misfit(rollout.episode, self._task, self._config.simulator.control_period_s)
+        return outcome_misfit(played, self._task, self._config.simulator.control_period_s)
 
     def _answer(self, actor: str, receipt: Receipt) -> None:
         self._bus.deliver(self._bus.keys.receipt(Role.EVALUATOR, actor), receipt)
@@ -360,7 +382,7 @@ class Evaluator:
         return {seed: outcome for seed, outcome in outcomes.items() if seed in suite.test_seeds}
 
 
-def _report_trial(played: Episode | EpisodeFailed, result: str) -> None:
+def _report_trial(played: EpisodeOutcome | EpisodeFailed, result: str) -> None:
     suite = "" if played.conditions is None else f"{played.suite} "
     version = played.policy_version
     LOG.info("policy %d, %strial %d: %s", version, suite, played.seed, plain(result))
@@ -370,17 +392,16 @@ def _can_be_disturbed(backend: str, ability: Ability | None, player: Player) -> 
     return player.backend == backend and (ability is None or ability in player.abilities)
 
 
-def _verdict(rollout: Rollout) -> Verdict:
-    episode = rollout.episode
+def _verdict(played: EpisodeOutcome) -> Verdict:
     return Verdict(
-        run_id=rollout.run_id,
-        policy_version=episode.policy_version,
-        task=episode.task,
-        seed=episode.seed,
-        situation=episode.situation,
-        outcome=episode.outcome,
-        backend=episode.backend,
-        conditions=episode.conditions,
+        run_id=played.training,
+        policy_version=played.policy_version,
+        task=played.task,
+        seed=played.seed,
+        situation=played.situation,
+        outcome=played.outcome,
+        backend=played.backend,
+        conditions=played.conditions,
     )
 
 

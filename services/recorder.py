@@ -1,6 +1,7 @@
 """The recorder: writes every rollout to disk, and keeps the history of the run.
 
-Actors keep a rollout until its receipt has come from the recorder as well as from the evaluator.
+Actors keep a rollout until a recorder has given its receipt. A run may have several recorders, each
+with a folder and an id of its own: each records every rollout that is sent while it is there.
 The learner keeps the tutored sequences, in the same file format.
 """
 

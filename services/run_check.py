@@ -29,7 +29,7 @@ from proto.codec import MessageError
 from proto.config import Config, load_config
 from proto.episode import Kind
 from proto.errors import UserError
-from proto.outbox import PUT_ASIDE, message_problem
+from proto.outbox import PREPARED, PUT_ASIDE, message_problem
 from proto.recordings.episodes import EpisodeSummary, read_summary
 from services.trials.trial_log import CountedTrial, parse_line
 
@@ -422,7 +422,7 @@ def _walk(folder: Path) -> Iterator[Path]:
 def _belongs(relative: Path) -> bool:
     parts: Sequence[str] = relative.parts
     if parts[0] == "outbox":
-        return len(parts) == 4 and relative.suffix == ".message"
+        return len(parts) == 4 and relative.suffix in (".message", PREPARED)
     if len(parts) > 2:
         return False
     folder = parts[0] if len(parts) == 2 else ""

@@ -28,6 +28,7 @@ ONLY_IN = {
 MAY_WRITE = {
     "services/playing/video_file.py": "a video in a temporary folder, which storage then copies",
     "services/monitoring/event_file.py": "a video in memory",
+    "services/bus_bench.py": "logs of the processes that it measures, in a temporary folder",
     "proto/storage.py": "all writing goes through it",
     "proto/run_locks.py": "an empty file that is locked; nothing is kept in it",
     "sim_assets/icub_visuals.py": "a cache, built in a folder that is renamed when it is complete",

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import socket
 from collections.abc import Callable, Collection, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -25,7 +26,9 @@ from services.arguments.common import config_of, overrides_of, start_logging
 LOG = logging.getLogger(__name__)
 
 HEARTBEAT_FILE: Final = "VMDNN_HEARTBEAT_FILE"
-"""Environment variable with the path of an existing file; a supervised process touches it."""
+"""Environment variable with the path of a file that a supervised process touches."""
+SYSTEMD_SOCKET: Final = "NOTIFY_SOCKET"
+"""Environment variable with the socket on which systemd hears of a process that it supervises."""
 HEARTBEAT_S: Final = 1.0
 STUCK_S: Final = 600.0
 """The heartbeat ends when the main loop of a process has not gone on for this time."""
@@ -105,20 +108,35 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
 
 
 def _supervised() -> bool:
-    return HEARTBEAT_FILE in os.environ
+    return HEARTBEAT_FILE in os.environ or SYSTEMD_SOCKET in os.environ
 
 
 def _heartbeat(lifecycle: Lifecycle) -> AbstractContextManager[None]:
-    """Touch the supervisor's file as long as the main loop goes on."""
+    """Tell whoever supervises this process that it lives, as long as the main loop goes on."""
     if not _supervised():
         return nullcontext()
-    file = Path(os.environ[HEARTBEAT_FILE])
+    path = os.environ.get(HEARTBEAT_FILE)
+    file = None if path is None else Path(path)
+    if file is not None:
+        with suppress(OSError):  # the supervisor's folder is gone, or full
+            file.touch()
 
     def beat() -> None:
-        if lifecycle.idle_s < STUCK_S and file.exists():
+        if lifecycle.idle_s >= STUCK_S:
+            return
+        if file is not None and file.exists():
             os.utime(file)
+        _tell_systemd("READY=1\nWATCHDOG=1")
 
     return every(HEARTBEAT_S, beat)
+
+
+def _tell_systemd(state: str) -> None:
+    """Send a state to systemd, if it has started this process."""
+    if name := os.environ.get(SYSTEMD_SOCKET):
+        address = f"\0{name[1:]}" if name.startswith("@") else name
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+            systemd.sendto(state.encode(), address)
 
 
 def _effective(

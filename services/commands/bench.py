@@ -14,6 +14,7 @@ from actors.bench import bench_backends
 from learner.bench.bptt import bench_bptt
 from proto.config import Config
 from services.arguments.common import add_config, config_of, positive
+from services.bus_bench import bench_bus
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +36,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default=len(os.sched_getaffinity(0)),
         help="threads of each implementation",
     )
-    for subject in (actor, bptt):
+    bus = subjects.add_parser(
+        "bus",
+        help="episodes a second through hub, evaluator and learner with up to 128 light actors,"
+        " beside the same bytes without vmdnn",
+    )
+    for subject in (actor, bptt, bus):
         add_config(subject)
         subject.add_argument("--json", action="store_true", help="print JSON instead of lines")
 
@@ -45,6 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     config = config_of(arguments)
     if arguments.subject == "actor":
         return _run_actor(config, as_json=arguments.json)
+    if arguments.subject == "bus":
+        return _run_bus(config, as_json=arguments.json)
     measured = bench_bptt(
         config,
         batch=arguments.batch,
@@ -76,6 +84,23 @@ def _run_actor(config: Config, *, as_json: bool) -> int:
     return 0
 
 
+def _run_bus(config: Config, *, as_json: bool) -> int:
+    speed = _rounded(asdict(bench_bus(config)))
+    if as_json:
+        print(json.dumps(speed))
+        return 0
+    for name, value in speed.items():
+        if isinstance(value, list):
+            print(f"{name}:")
+            for number, flow in enumerate(value):
+                if number == 0:
+                    print(" ", *(f"{key:>14}" for key in flow))
+                print(" ", *(f"{each:14.6g}" for each in flow.values()))
+        else:
+            print(f"{name:17} {value}")
+    return 0
+
+
 def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _round(value) for name, value in values.items()}
 
@@ -83,4 +108,6 @@ def _rounded(values: Mapping[str, Any]) -> dict[str, Any]:
 def _round(value: object) -> object:
     if isinstance(value, Mapping):
         return _rounded(value)
+    if isinstance(value, list | tuple):
+        return [_round(each) for each in value]
     return round(value, 4) if isinstance(value, float) else value

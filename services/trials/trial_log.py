@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -29,7 +29,7 @@ from proto.episode import (
     Outcome,
 )
 from proto.errors import UserError
-from proto.messages import Count, EpisodeFailed, Rollout
+from proto.messages import Count, EpisodeFailed, EpisodeOutcome, Rollout
 from proto.plain_text import plain
 from proto.recordings import format1
 from proto.storage import append_line, drop_unfinished_line
@@ -81,7 +81,7 @@ class CountedTrial:
         return suite_of(self.conditions)
 
     @classmethod
-    def of(cls, episode: Episode, run_id: str) -> CountedTrial:
+    def of(cls, episode: Episode | EpisodeOutcome, run_id: str) -> CountedTrial:
         """Make the line of an episode, played with a policy of the training `run_id`."""
         return cls(
             run_id=run_id,
@@ -194,6 +194,28 @@ class TrialLog:
             UserError: the file cannot be written; the trial is not counted.
         """
         return self._add(CountedTrial.of(rollout.episode, rollout.run_id))
+
+    def add_outcomes(self, played: Iterable[EpisodeOutcome]) -> list[EpisodeOutcome]:
+        """Write trials to disk, all at once, and count them.
+
+        Returns:
+            Those that were not counted before.
+
+        Raises:
+            UserError: the file cannot be written; none is counted.
+        """
+        new: dict[tuple[str, int, str, int], EpisodeOutcome] = {}
+        for each in played:
+            counted = self._outcomes.get((each.training, each.policy_version, each.suite), {})
+            if each.seed not in counted:
+                key = (each.training, each.policy_version, each.suite, each.seed)
+                new.setdefault(key, each)
+        trials = [CountedTrial.of(each, each.training) for each in new.values()]
+        if trials:
+            append_line(self._path, b"".join(trial.line() for trial in trials))
+        for trial in trials:
+            self._count(trial)
+        return list(new.values())
 
     def add_failure(self, report: EpisodeFailed) -> bool:
         """Count a trial that has no outcome as a failure; otherwise as `add`."""

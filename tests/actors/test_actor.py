@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 from deadly_simulator import DEADLY_CASE, DEADLY_SEED
 from fitting import make_policy
+from outcomes import NOT_LIFTED, PRECISE
 from ports import free_endpoint
 from processes import PATIENCE_S, eventually, listening_hub, stop, vmdnn
 
+from actors.actor import is_recorded
 from actors.left_outboxes import LeftOutboxes
 from actors.receipts import Receipts
 from actors.tasks.experiment1.plan import plan
@@ -27,6 +29,7 @@ from proto.bus import Bus, open_bus
 from proto.codec import encode
 from proto.config import (
     HubConfig,
+    RecorderConfig,
     TaskConfig,
     load_config,
 )
@@ -39,6 +42,7 @@ from proto.messages import (
     ControlReply,
     Correction,
     EpisodeFailed,
+    EpisodeOutcome,
     Live,
     PolicyVersion,
     Receipt,
@@ -83,6 +87,7 @@ class ActorSetup:
         self.trials: list[Trial] = []
         self.sequences: list[Episode] = []
         self.rollouts: list[Rollout] = []
+        self.outcomes: list[EpisodeOutcome] = []
         self.lives: list[Live] = []
         self.metrics: ActorMetrics | None = None
         self.failures: list[EpisodeFailed] = []
@@ -108,6 +113,7 @@ class ActorSetup:
         self.bus.answer(keys.request_trial, TrialRequest, lambda _: self._next(self.trials))
         self.bus.subscribe(keys.sequence(), self._on_sequence, Sequence)
         self.bus.subscribe(keys.rollout(), self._on_rollout, Rollout)
+        self.bus.subscribe(keys.outcome(), self._on_outcome, EpisodeOutcome)
         self.bus.subscribe(keys.failure(), self._on_failure, EpisodeFailed)
         self.bus.subscribe(keys.live(), self.lives.append, Live)
         self.bus.subscribe(keys.metrics(Role.ACTOR), self._on_metrics, ActorMetrics)
@@ -151,7 +157,11 @@ class ActorSetup:
 
     def _on_rollout(self, rollout: Rollout) -> None:
         self.rollouts.append(rollout)
-        self._acknowledge(rollout.episode, Role.EVALUATOR, *self.recorders)
+        self._acknowledge(rollout.episode, *self.recorders)
+
+    def _on_outcome(self, outcome: EpisodeOutcome) -> None:
+        self.outcomes.append(outcome)
+        self._acknowledge(outcome, Role.EVALUATOR)
 
     def _on_metrics(self, metrics: ActorMetrics) -> None:
         self.metrics = metrics
@@ -161,7 +171,7 @@ class ActorSetup:
         role = Role.EVALUATOR if report.kind is Kind.TRIAL else Role.LEARNER
         self._give(role, report.actor, Receipt(report.id))
 
-    def _acknowledge(self, episode: Episode, *roles: Role) -> None:
+    def _acknowledge(self, episode: Episode | EpisodeOutcome, *roles: Role) -> None:
         for role in roles if self.gives_receipts else ():
             receipt = Receipt(episode.id, self.refusal)
             self._give(role, episode.actor, receipt)
@@ -322,6 +332,22 @@ def test_receipts_of_those_who_store_nothing_delete_nothing(setup: ActorSetup) -
     assert metrics.outbox == 1
     setup.bus.deliver(key, receipt)
     setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
+
+
+def test_an_actor_whose_folder_ends_with_it_waits_for_receipts_before(setup: ActorSetup) -> None:
+    setup.gives_receipts = False
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.start_actor("--drain", "60")
+    eventually(lambda: len(setup.sequences) >= 1, "a demonstration")
+    setup.actor.terminate()
+    setup.cases.append(TutoringCase("experiment1", 6, 0))
+    before = len(setup.sequences)
+    eventually(lambda: len(setup.sequences) > before, "it is sent again")
+    assert setup.actor.poll() is None
+    setup.gives_receipts = True
+    assert setup.actor.wait(60) == 0
+    assert {episode.seed for episode in setup.sequences} == {5000}, "it plays no more"
+    assert not list(setup.outbox.rglob("*.message"))
 
 
 def test_a_killed_actor_sends_messages_without_receipt_again(setup: ActorSetup) -> None:
@@ -498,6 +524,38 @@ def test_when_stopped_it_aborts_its_episode_and_ends_cleanly(
     assert setup.bus.present(Role.ACTOR) == set()
 
 
+@pytest.mark.parametrize("recorded", [True, False])
+def test_old_rollouts_go_to_recorders_and_their_outcomes_to_the_evaluator(
+    setup: ActorSetup, make_episode: MakeEpisode, recorded: bool
+) -> None:
+    """Former versions sent them to the evaluator as well."""
+    left = Outbox(setup.outbox / "rollouts", lambda *_: None)
+    receivers = [Role.EVALUATOR, Role.RECORDER] if recorded else [Role.EVALUATOR]
+    for number in range(2 * IN_FLIGHT):  # more than are sent before the first receipts come
+        episode = make_episode(20, id=f"old-{number}", actor="actor-1", training="training")
+        message = Rollout(replace(episode, kind=Kind.TRIAL), "training")
+        left.add(episode.id, setup.bus.keys.rollout("actor-1"), encode(message), receivers)
+    setup.start_actor()
+    setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
+    ids = {f"old-{number}" for number in range(2 * IN_FLIGHT)}
+    assert {outcome.id for outcome in setup.outcomes} == ids
+    assert {rollout.episode.id for rollout in setup.rollouts} == (ids if recorded else set())
+
+
+def test_a_share_of_the_precise_episodes_is_recorded_and_all_others(
+    make_episode: MakeEpisode,
+) -> None:
+    few = RecorderConfig(share=0.25)
+    precise = [make_episode(2, id=f"{n}", kind=Kind.TRIAL, outcome=PRECISE) for n in range(400)]
+    assert 60 < sum(is_recorded(episode, few) for episode in precise) < 140
+    assert all(is_recorded(episode, RecorderConfig()) for episode in precise)
+    assert not any(is_recorded(episode, RecorderConfig(share=0.0)) for episode in precise)
+    failed = [replace(episode, outcome=NOT_LIFTED) for episode in precise]
+    assert all(is_recorded(episode, RecorderConfig(share=0.0)) for episode in failed)
+    practice = replace(failed[0], kind=Kind.PRACTICE)
+    assert not is_recorded(practice, RecorderConfig(practice=False))
+
+
 def leave_sequences(setup: ActorSetup, make_episode: MakeEpisode, actor: str) -> None:
     """Put sequences into an actor's outbox, with the keys of a run of another name."""
     left = Outbox(setup.outbox.parent / actor / "sequences", lambda *_: None)
@@ -556,5 +614,7 @@ def test_a_rollout_stays_until_the_recorder_has_it_too(
     eventually(lambda: len(setup.rollouts) == 2, "it is sent again")
     metrics = setup.wait_for_metrics(lambda metrics: bool(metrics.waiting_for))
     assert (metrics.outbox, metrics.waiting_for) == (1, "receipts of the recorder")
+    assert [outcome.id for outcome in setup.outcomes] == [setup.rollouts[0].episode.id]
+    assert setup.outcomes[0] == EpisodeOutcome.of(setup.rollouts[0].episode)
     setup.recorders.append(Role.RECORDER)
     setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)

@@ -16,7 +16,8 @@ import pytest
 from ports import free_endpoint
 from processes import eventually
 
-from deploy.run_local import DEFAULT_CONFIG, actors_of, check_actors, main, programs
+from deploy.processes import programs
+from deploy.run_local import DEFAULT_CONFIG, actors_of, check_actors, main
 from proto.config import Config, LearnerConfig, load_config
 from proto.run_locks import owned_run
 

@@ -8,22 +8,22 @@ import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 from processes import eventually
 
+from deploy.processes import FIRST_BEAT_WITHIN_S, STUCK_AFTER_S, Program
 from deploy.supervision import (
-    FIRST_BEAT_WITHIN_S,
-    STUCK_AFTER_S,
     ProcessFailedError,
     ProcessState,
-    Program,
     Supervisor,
     SupervisorEndedError,
     Watchdog,
 )
 from proto.errors import UserError
+from proto.lifecycle import Lifecycle
 
 SLEEP = (sys.executable, "-c", "import time; time.sleep(600)")
 
@@ -58,7 +58,7 @@ class Watch:
         self.told: list[str] = []
         self.now_s = 1000.0
         self._supervisor = supervisor
-        self._watchdog = Watchdog(supervisor, self.told.append, clock=lambda: self.now_s)
+        self.watchdog = Watchdog(supervisor, self.told.append, clock=lambda: self.now_s)
         supervisor.start(supervisor.programs[0].name)
 
     @property
@@ -69,12 +69,12 @@ class Watch:
         """Look once a second for so many seconds of the clock."""
         for _ in range(round(seconds)):
             self.now_s += 1.0
-            self._watchdog.look()
+            self.watchdog.look()
 
     def wait_for_another(self, than: int) -> None:
         def another() -> bool:
             self.now_s += 0.1  # slowly: supervisord needs a moment to see that a process has ended
-            self._watchdog.look()
+            self.watchdog.look()
             return self.pid not in (0, than)
 
         eventually(another, "another process runs")
@@ -217,3 +217,23 @@ def test_no_process_outlives_a_killed_supervisor(tmp_path: Path, deadly: int) ->
         assert is_alive(child)
         parent.send_signal(deadly)
     eventually(lambda: not is_alive(child), "the child is gone")
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_supervisord_may_be_stopped_with_everything_else(tmp_path: Path, asked: bool) -> None:
+    """Slurm and systemd send SIGTERM to all processes at once."""
+    with Supervisor([Program("actor", SLEEP)], tmp_path) as supervisor:
+        watch = Watch(supervisor)
+        actor = watch.pid
+        parent = Path(f"/proc/{actor}/stat").read_text().rpartition(")")[2].split()[1]
+        lifecycle = Lifecycle()
+        if asked:
+            lifecycle.stop()
+        os.kill(int(parent), signal.SIGTERM)
+
+        def has_ended() -> bool:
+            watch.watchdog.look_unless_stopping(lifecycle)
+            return asked and not is_alive(actor)
+
+        with nullcontext() if asked else pytest.raises(SupervisorEndedError):
+            eventually(has_ended, "its end")

@@ -25,8 +25,8 @@ from proto.messages import (
     Control,
     ControlReply,
     EpisodeFailed,
+    EpisodeOutcome,
     Receipt,
-    Rollout,
     Trial,
     TrialRequest,
     Verdict,
@@ -114,17 +114,17 @@ class EvaluatorSetup:
         return self.metrics
 
     def send(self, actor: Bus, seed: int, version: int, **fields: object) -> Episode:
-        """Send a rollout until its receipt arrives."""
+        """Send an outcome until its receipt arrives."""
         episode = self._episode(actor, seed, version, **fields)
-        rollout = Rollout(episode, episode.training)
-        assert self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout) == ""
+        outcome = EpisodeOutcome.of(episode)
+        assert self._answer(actor, episode.id, actor.keys.outcome(actor.id), outcome) == ""
         return episode
 
     def refused(self, actor: Bus, seed: int, version: int, **fields: object) -> str:
-        """Send a rollout until it is refused; return the reason."""
+        """Send an outcome until it is refused; return the reason."""
         episode = self._episode(actor, seed, version, **fields)
-        rollout = Rollout(episode, episode.training)
-        return self._answer(actor, episode.id, actor.keys.rollout(actor.id), rollout)
+        outcome = EpisodeOutcome.of(episode)
+        return self._answer(actor, episode.id, actor.keys.outcome(actor.id), outcome)
 
     def fail(self, actor: Bus, report: EpisodeFailed) -> str:
         """Report a failed simulation until its receipt arrives; return the refusal."""
@@ -229,8 +229,8 @@ def test_nothing_counts_that_was_not_asked_for(setup: EvaluatorSetup) -> None:
     # Policies that this run never published change nothing, nor do trials of them.
     for odd in (make_policy(10**6, task="reaching"), replace(make_policy(2), version=5, epoch=50)):
         setup.learner.publish_newest(setup.learner.keys.policy, odd)
-    unheard = Rollout(setup._episode(stranger, 70, 9, id="version-9"), "training")
-    stranger.deliver(stranger.keys.rollout("s"), unheard)
+    unheard = EpisodeOutcome.of(setup._episode(stranger, 70, 9, id="version-9"))
+    stranger.deliver(stranger.keys.outcome("s"), unheard)
     setup.send(actor, 70, 1, outcome=PRECISE)
     many = [Outcome(False, False, False, f"reason_{number}", {}) for number in range(2)]
     assert [*setup.ask(actor, 1), *setup.ask(actor, 1)] == [71, 72]
