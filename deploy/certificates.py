@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from deploy.supervision import BAD_INPUT
+from deploy.processes import BAD_INPUT
 from proto.config import HubConfig
 from proto.errors import UserError
 from proto.permissions import Holder

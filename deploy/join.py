@@ -9,15 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from deploy.run_local import VMDNN, RunConsole
-from deploy.supervision import (
-    BAD_INPUT,
-    ProcessFailedError,
-    Program,
-    Supervisor,
-    SupervisorEndedError,
-    Watchdog,
-)
+from deploy.processes import BAD_INPUT, VMDNN, Program
+from deploy.run_local import RunConsole
+from deploy.supervision import ProcessFailedError, Supervisor, SupervisorEndedError, Watchdog
 from proto.config import Config, load_config
 from proto.errors import UserError
 from proto.keys import Role
@@ -90,7 +84,7 @@ def join(config: Config, command: Sequence[str], number: int) -> None:
                 f" {config.hub.endpoint}; logs in {logs}"
             )
             while not lifecycle.stopping:
-                watchdog.look()
+                watchdog.look_unless_stopping(lifecycle)
                 lifecycle.wait(LOOK_EVERY_S)
             tell("stopping; the same command joins the run again")
 

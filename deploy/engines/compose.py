@@ -37,7 +37,14 @@ def _service(program: Program, plan: Plan) -> dict[str, Any]:
     endpoint = plan.everywhere if hub else f"{plan.link}/hub:{plan.port}"
     service: dict[str, Any] = {
         "image": IMAGE,
-        "command": [*program.command, "--connect", endpoint, "--set", f"run.folder={DATA}"],
+        "command": [
+            *program.command,
+            "--connect",
+            endpoint,
+            "--set",
+            f"run.folder={DATA}",
+            *plan.admission,
+        ],
         "environment": {"OMP_NUM_THREADS": str(program.threads), HEARTBEAT_FILE: HEARTBEAT},
         "configs": [{"source": "vmdnn", "target": CONFIG}],
         "read_only": True,

@@ -114,8 +114,10 @@ def _container(program: Program, plan: Plan) -> Manifest:
     hub = program.role is Role.HUB
     endpoint = plan.everywhere if hub else f"{plan.link}/{HUB}:{plan.port}"
     words = ["--connect", "$(HUB)", "--set", f"run.folder={DATA}"]
+    words += ["--set", f"hub.certificates={CERTIFICATES}", "--set", "hub.insecure=$(INSECURE)"]
     environment: list[Manifest] = [
         {"name": "HUB", "value": endpoint},
+        {"name": "INSECURE", "value": str(plan.insecure).lower()},
         {"name": "OMP_NUM_THREADS", "value": str(program.threads)},
         {"name": HEARTBEAT_FILE, "value": HEARTBEAT},
     ]

@@ -57,6 +57,16 @@ class Plan:
         """Endpoint at which the hub listens for other machines."""
         return f"{self.link}/0.0.0.0:{self.port}"
 
+    @property
+    def insecure(self) -> bool:
+        """Whether other machines reach the hub without certificates."""
+        return self.link == "tcp"
+
+    @property
+    def admission(self) -> tuple[str, ...]:
+        """Arguments of a process that must be told that links to the hub are not protected."""
+        return ("--set", "hub.insecure=true") if self.insecure else ()
+
 
 class _Dumper(yaml.SafeDumper):
     """Writes YAML without anchors, and long texts line by line."""

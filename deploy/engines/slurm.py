@@ -73,7 +73,7 @@ def _services(plan: Plan, services: list[Program], actors: list[Program]) -> str
     command = shlex.join(
         [
             *(plan.python, "-m", "deploy.run_local", "--config", str(plan.out / "config.yaml")),
-            *("--actors", "0", "--set", f"hub.endpoint={plan.everywhere}"),
+            *("--actors", "0", "--set", f"hub.endpoint={plan.everywhere}", *plan.admission),
         ]
     )
     head = _head(
@@ -106,7 +106,10 @@ exit "$status"
 def _actors(plan: Plan, actor: Program) -> str:
     backend = actor.command[actor.command.index("--config") + 2 :]
     command = shlex.join(
-        [*(plan.python, "-m", "deploy.actors", "--config", str(plan.out / "config.yaml")), *backend]
+        [
+            *(plan.python, "-m", "deploy.actors", "--config", str(plan.out / "config.yaml")),
+            *(*backend, *plan.admission),
+        ]
     )
     head = _head(
         _job_name(plan, actor.name),
