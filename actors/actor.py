@@ -316,7 +316,7 @@ class Actor:
             return f"an answer of the {' and the '.join(silent)}"
         if missing := sorted(self._sequences.missing | self._rollouts.missing):
             return f"receipts of the {' and the '.join(missing)}"
-        return "something to play" if self._policy else "something to play, or a policy"
+        return "something to play" if self._policy else "the first policy"
 
     def _deliver(self, key: str, wire: Wire) -> None:
         """Send what is in the outbox, also if it was kept while the run had another name."""

@@ -8,7 +8,7 @@ import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Final
 
@@ -33,7 +33,8 @@ from proto.run_locks import owned_run
 from services.arguments.common import config_argument, integer
 from services.board import Board, RunView
 from services.machine.ports import port_trouble
-from services.terminal.display import display
+from services.terminal.display import Show, display
+from services.terminal.run_progress import ProgressMeter
 from services.terminal.run_words import success_words
 
 DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
@@ -175,7 +176,8 @@ def _run(config: Config, actors: Mapping[str, int], console: Console) -> None:
             if bus is not None:
                 for program in supervisor.programs[1:]:
                     supervisor.start(program.name)
-                view = _follow(Board(bus), watchdog, lifecycle, console)
+                show = display(console, ProgressMeter(started_s=started_s), _expected(actors))
+                view = _follow(Board(bus), watchdog, lifecycle, show)
         console.print("stopping", highlight=False)
     if view is not None:
         text = summary(view, config, time.monotonic() - started_s)
@@ -250,9 +252,20 @@ def summary(view: RunView, config: Config, wall_s: float) -> str:
     return "\n".join(lines)
 
 
-def _follow(board: Board, watchdog: Watchdog, lifecycle: Lifecycle, console: Console) -> RunView:
+def _expected(actors: Mapping[str, int]) -> Mapping[Role, int]:
+    """Return the number of processes by role that are started, besides the hub."""
+    others = dict.fromkeys((Role.LEARNER, Role.EVALUATOR, Role.RECORDER), 1)
+    return {**others, Role.ACTOR: sum(actors.values())}
+
+
+def _follow(
+    board: Board,
+    watchdog: Watchdog,
+    lifecycle: Lifecycle,
+    showing: AbstractContextManager[Show],
+) -> RunView:
     """Show the state of the run until it is done or is to stop; return the last state."""
-    with display(console) as show:
+    with showing as show:
         while True:
             view = board.view()
             show(view)

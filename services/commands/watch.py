@@ -16,7 +16,8 @@ from services.arguments.common import add_connection, config_of
 from services.board import Board, RunView
 from services.terminal.console import make_console
 from services.terminal.display import display
-from services.terminal.run_tables import run_tables
+from services.terminal.run_progress import ProgressMeter
+from services.terminal.run_tables import WIDE, run_tables
 
 ONCE_WITHIN_S: Final = 2.5 * METRICS_PERIOD_S
 
@@ -37,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
             return _show_once(board.wait_for_all(ONCE_WITHIN_S), arguments.json)
         lifecycle = Lifecycle()
         lifecycle.stop_on_signals()
-        with display(make_console()) as show:
+        with display(make_console(), ProgressMeter(), {}) as show:
             while not lifecycle.stopping:
                 show(board.view())
                 lifecycle.wait(METRICS_PERIOD_S)
@@ -55,5 +56,6 @@ def _show_once(view: RunView, as_json: bool) -> int:
     if as_json:
         print(json.dumps(view.as_json(), indent=2))
     else:
-        make_console().print(run_tables(view))
+        console = make_console()
+        console.print(run_tables(view, wide=console.width >= WIDE))
     return 0
