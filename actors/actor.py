@@ -6,6 +6,7 @@ import logging
 import secrets
 import threading
 import time
+from collections import deque
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -66,6 +67,8 @@ IDLE_S: Final = 0.3
 OUTBOX_PERIOD_S: Final = 1.0
 OUTBOX_LIMIT: Final = 100
 """An actor plays no more for a receiver that owes it so many receipts."""
+POLICIES_KEPT: Final = 32
+"""An actor keeps so many policies that are newer than the one it acts with."""
 COMPARE_AGAIN_S: Final = 5.0
 """How long to wait before the settings are compared again, if they differ."""
 PRACTICE_LIMIT: Final = 8
@@ -194,7 +197,9 @@ class Actor:
         )
         self._policy: NetworkPolicy | None = None
         self._policy_run = ""
-        self._offered: _Offer | None = None
+        # With first trials every version; otherwise only the newest.
+        kept = POLICIES_KEPT if config.evaluator.first_trials else 1
+        self._offers: deque[_Offer] = deque(maxlen=kept)  # newer than the policy, oldest first
         self._offering = threading.Lock()
         self._pace = Pace()
         self._episodes = 0
@@ -262,8 +267,8 @@ class Actor:
     def _play_next(self) -> None:
         assignment = None
         if not self._lifecycle.paused and self._agrees():
-            self._take_newest_policy()
-            assignment = self._tutoring() or self._trial() or self._practice()
+            first = self._first_trial()
+            assignment = first or self._tutoring() or self._trial() or self._practice()
         if assignment is None:
             self._lifecycle.waits_for(self._missing)
             self._lifecycle.wait(IDLE_S)
@@ -530,7 +535,7 @@ class Actor:
         when_disk_allows(self._lifecycle, lambda: outbox.add(report.id, key, wire, [receiver]))
 
     def _on_policy(self, message: PolicyVersion) -> None:
-        """Keep the newest policy of this run until the next episode begins."""
+        """Keep a newer policy of this run until the next episode begins."""
         try:
             offered = _Offer(message.run_id, message.version, policy_of(message, self._config))
         except UserError as error:
@@ -538,15 +543,31 @@ class Actor:
             LOG.warning("policy %d cannot be used: %s", message.version, plain(error))
             return
         with self._offering:
-            waiting = self._offered
+            waiting = self._offers[-1] if self._offers else None
             if waiting is None or offered.is_newer_than(waiting.run_id, waiting.version):
-                self._offered = offered
+                if waiting is not None and offered.run_id != waiting.run_id:
+                    self._offers.clear()
+                self._offers.append(offered)
 
-    def _take_newest_policy(self) -> None:
+    def _first_trial(self) -> Assignment | None:
+        """Take the newer policies, one after the other, until there is no newer one.
+
+        If `evaluator.first_trials` is set, the evaluator is asked first whether it lacks first
+        trials of the policy at hand; one of them is returned before a newer policy is taken.
+        """
+        while self._offers:
+            if self._policy is not None and self._config.evaluator.first_trials:
+                trial = self._trial()
+                if trial is not None:
+                    return trial
+            self._take_next_policy()
+        return None
+
+    def _take_next_policy(self) -> None:
         with self._offering:
-            offered, self._offered = self._offered, None
+            offered = self._offers.popleft()
         held = self._policy.version if self._policy else 0
-        if offered is None or not offered.is_newer_than(self._policy_run, held):
+        if not offered.is_newer_than(self._policy_run, held):
             return
         try:
             policy = NetworkPolicy(offered.checkpoint, "the policy")

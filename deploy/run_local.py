@@ -22,6 +22,7 @@ from deploy.supervision import (
     SupervisorEndedError,
     Watchdog,
 )
+from learner.pretrained import PREFIX, pretrained_names
 from proto.bus import Bus, NoHubError, open_bus
 from proto.config import Config, load_config
 from proto.errors import UserError
@@ -30,14 +31,16 @@ from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore, SuiteScore
 from proto.run_locks import owned_run
-from services.arguments.common import config_argument, integer
+from services.arguments.common import built_in_names, config_argument, integer
 from services.board import Board, RunView
 from services.machine.ports import port_trouble
 from services.terminal.display import Show, display
 from services.terminal.run_progress import ProgressMeter
-from services.terminal.run_words import success_words
+from services.terminal.run_words import duration_words, success_words
 
 DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
+FEW_CASES: Final = 10
+"""With so few tutored cases a run teaches nothing, and says so at its end."""
 VMDNN: Final = str(Path(sys.executable).with_name("vmdnn"))
 
 
@@ -241,15 +244,61 @@ def check_can_be_done(config: Config) -> None:
 
 def summary(view: RunView, config: Config, wall_s: float) -> str:
     """Return the result of a run in a few lines."""
-    minutes, seconds = divmod(round(wall_s), 60)
     lines = [
         f"run {config.run.name}: {view.policy_version} policy versions"
-        f" in {minutes} min {seconds} s",
+        f" in {duration_words(wall_s)}",
         *_suite_lines(view.suites),
+        *_untried_lines(view, config),
+        *_expectation_lines(config),
         f"files: {config.run_folder}/ with config.yaml, tutoring, checkpoints, policies, "
         "rollouts, evaluation, logs",
     ]
     return "\n".join(lines)
+
+
+def _untried_lines(view: RunView, config: Config) -> list[str]:
+    """Say which policy versions before the newest one have fewer trials, and why."""
+    if not view.suites or not view.policy_version:
+        return []
+    suite = view.suites[0]
+    counted = {score.version: score.trials for score in suite.policies}
+    fewer = [
+        version
+        for version in range(1, view.policy_version)
+        if counted.get(version, 0) < suite.trials
+    ]
+    if not fewer:
+        return []
+    words = f"version {fewer[0]}" if len(fewer) == 1 else f"{len(fewer)} earlier versions"
+    verb = "has" if len(fewer) == 1 else "have"
+    return [
+        f"{words} {verb} fewer than {suite.trials} trials, because a newer version came first;"
+        f" to play the rest: vmdnn evaluate --run {config.run_folder} --policy-version all"
+    ]
+
+
+def _expectation_lines(config: Config) -> list[str]:
+    """Say that little success is to be expected of a run with few tutored cases; and what next."""
+    cases = config.learner.cases
+    if cases is None or len(cases) > FEW_CASES:
+        return []
+    return [
+        f"no success is expected here: {len(cases)} tutored cases and {config.learner.epochs}"
+        " epochs show that everything works, they do not teach the task",
+        *_next_steps(config.task.name),
+    ]
+
+
+def _next_steps(task: str) -> list[str]:
+    """Return commands that show success in a task."""
+    trained = f"{PREFIX}{task}"
+    steps = [f"to train a good policy, tutor all cases: deploy/run_local.sh --config {task}"]
+    if trained in pretrained_names():
+        steps.append(
+            f"to see a trained policy now: vmdnn evaluate --policy {trained} --task {task}"
+            " --trials 3 --video trials.mp4"
+        )
+    return steps if task in built_in_names() else steps[1:]
 
 
 def _expected(actors: Mapping[str, int]) -> Mapping[Role, int]:
@@ -309,6 +358,8 @@ def _score_lines(suite: SuiteScore) -> list[str]:
     if score is None:
         return ["no trial was counted" + (f": {suite.unplayable}" if suite.unplayable else "")]
     counted = f"{score.trials} of {suite.trials} trials counted"
+    if not score.lenient.successes:
+        return [f"policy {score.version}, {counted}: no success"]
     return [
         f"policy {score.version}, {counted}; successes, rate and its 95 % interval:",
         *(

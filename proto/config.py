@@ -499,6 +499,9 @@ class EvaluatorConfig(_Section):
         trials_per_policy: number of trials of each policy version.
         seed: seed of the first trial; trial i has the seed `seed + i`.
         lease_s: a trial that is not finished after this time is assigned again (s).
+        first_trials: number of trials of each policy version in each suite that actors finish
+            before they take a newer version. With 0 they take the newest version at once, so that
+            versions that follow each other quickly get few trials or none.
         suites: the suites, the most important first; None for `unlearned` alone.
     """
 
@@ -506,6 +509,7 @@ class EvaluatorConfig(_Section):
     # The bound keeps the seeds of all trials below those of corrections and practice.
     seed: Annotated[int, Field(strict=True, ge=0, le=TRIALS_BELOW - 2**28)] = 1000
     lease_s: Positive = 60.0
+    first_trials: Natural = 0
     suites: Annotated[tuple[SuiteConfig, ...], AfterValidator(_check_suites)] | None = None
 
 

@@ -17,6 +17,7 @@ from proto.plain_text import plain_lines
 
 LARGEST_SEED: Final = 2**32 - 1
 LARGEST_PORT: Final = 65_535
+_BUILT_IN: Final = Path(str(files("deploy")), "config")
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
@@ -76,12 +77,16 @@ def config_file(name: str) -> Path:
     path = Path(name)
     if path.is_file() or path.suffix or path.name != name:  # a run may have a folder of that name
         return path
-    built_in = {file.stem: file for file in Path(str(files("deploy")), "config").glob("*.yaml")}
-    if name not in built_in:
+    if name not in built_in_names():
         raise UserError(
-            f"config file {name} does not exist; built in are: {', '.join(sorted(built_in))}"
+            f"config file {name} does not exist; built in are: {', '.join(built_in_names())}"
         )
-    return built_in[name]
+    return _BUILT_IN / f"{name}.yaml"
+
+
+def built_in_names() -> list[str]:
+    """Names of the built-in configurations."""
+    return sorted(file.stem for file in _BUILT_IN.glob("*.yaml"))
 
 
 def config_argument(name: str) -> Path:

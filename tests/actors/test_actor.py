@@ -80,6 +80,7 @@ class ActorSetup:
         self.cases: list[TutoringCase | Correction] = []
         self.requests: list[TutoringRequest] = []
         self.trials: list[Trial] = []
+        self.first_trials: dict[int, list[Trial]] = {}
         self.sequences: list[Episode] = []
         self.rollouts: list[Rollout] = []
         self.lives: list[Live] = []
@@ -104,7 +105,7 @@ class ActorSetup:
         self._lock = threading.Lock()
         keys = self.bus.keys
         self.bus.answer(keys.request_tutoring, TutoringRequest, self._on_request)
-        self.bus.answer(keys.request_trial, TrialRequest, lambda _: self._next(self.trials))
+        self.bus.answer(keys.request_trial, TrialRequest, self._on_trial_request)
         self.bus.subscribe(keys.sequence(), self._on_sequence, Sequence)
         self.bus.subscribe(keys.rollout(), self._on_rollout, Rollout)
         self.bus.subscribe(keys.failure(), self._on_failure, EpisodeFailed)
@@ -139,6 +140,9 @@ class ActorSetup:
     def _on_request(self, request: TutoringRequest) -> object | None:
         self.requests.append(request)
         return self._next(self.cases)
+
+    def _on_trial_request(self, request: TrialRequest) -> object | None:
+        return self._next(self.first_trials.get(request.policy_version, self.trials))
 
     def _next(self, things: list[Any]) -> object | None:
         with self._lock:
@@ -350,6 +354,21 @@ def test_the_newest_of_several_policies_is_used(
     setup.wait_for_metrics(lambda metrics: metrics.policy_version > 0)
     eventually(lambda: len(setup.rollouts) >= 2, "it practises")
     assert {rollout.episode.policy_version for rollout in setup.rollouts} == {3}
+
+
+def test_first_trials_of_each_policy_come_before_a_newer_one(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.first_trials = {1: [Trial(70), Trial(71)], 2: [], 3: [Trial(70)]}
+    setup.start_actor("--set", "evaluator.first_trials=2", "--set", "actor.practice=false")
+    eventually(lambda: bool(setup.lives), "a demonstration is going on")
+    for version in (1, 2, 3, 4):
+        setup.publish(policy(version))
+    setup.wait_for_metrics(lambda metrics: metrics.policy_version == 4)
+    eventually(lambda: len(setup.rollouts) == 3, "all trials are played")
+    played = [(r.episode.policy_version, r.episode.seed) for r in setup.rollouts]
+    assert played == [(1, 70), (1, 71), (3, 70)]
 
 
 def test_a_refused_message_is_put_aside_and_delays_no_others(setup: ActorSetup) -> None:
