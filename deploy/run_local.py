@@ -245,8 +245,7 @@ def check_can_be_done(config: Config) -> None:
 def summary(view: RunView, config: Config, wall_s: float) -> str:
     """Return the result of a run in a few lines."""
     lines = [
-        f"run {config.run.name}: {view.policy_version} policy versions"
-        f" in {duration_words(wall_s)}",
+        f"run {config.run.name}: {view.policy_version} policy versions in {duration_words(wall_s)}",
         *_suite_lines(view.suites),
         *_untried_lines(view, config),
         *_expectation_lines(config),

@@ -41,6 +41,7 @@ from proto.situations import situation_of
 from proto.storage import make_folder
 from proto.suites import Player, Suite
 from services.trials.asked import AskedTrials, NotYetError
+from services.trials.run_folder import trial_log_file
 from services.trials.success import Tally
 from services.trials.trial_log import TrialLog
 
@@ -82,7 +83,7 @@ class Evaluator:
         self._config = config
         self._bus = bus
         self._lifecycle = lifecycle
-        self._log = TrialLog(config.run_folder / "evaluation" / "trials.jsonl")
+        self._log = TrialLog(trial_log_file(config.run_folder))
         self._leases: Leases[TrialKey] = Leases(config.evaluator.lease_s)
         self._suites = {suite.name: suite for suite in config.suites}
         self._practised = {suite.name: suite for suite in config.practised_suites()}

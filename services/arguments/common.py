@@ -15,6 +15,8 @@ from proto.config import Config, load_config
 from proto.errors import UserError
 from proto.plain_text import plain_lines
 
+INTERRUPTED: Final = 130
+"""Exit status of a command that Ctrl-C stopped."""
 LARGEST_SEED: Final = 2**32 - 1
 LARGEST_PORT: Final = 65_535
 _BUILT_IN: Final = Path(str(files("deploy")), "config")

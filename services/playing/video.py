@@ -34,19 +34,19 @@ _WHITE: Final = (255, 255, 255)
 
 
 def write_video(
-    episode: Episode,
+    episodes: Sequence[Episode],
     out: Path,
     config: Config,
     *,
     fps: float | None = None,
     on_frame: Callable[[], None] = lambda: None,
 ) -> None:
-    """Render every step of a recorded episode into a video.
+    """Render every step of recorded episodes into a video, one episode after the other.
 
     Nothing is simulated: the simulator shows the recorded joints and bodies of each step.
 
     Args:
-        episode: the recorded episode.
+        episodes: the recorded episodes, at least one; all of the same task and simulator.
         out: the file to write, .mp4 (H.264) or .gif; it appears under its name only when it is
             complete.
         config: the simulator that renders, and options of the task.
@@ -58,16 +58,22 @@ def write_video(
             needs an option of the task, or the file cannot be written.
     """
     check_video_name(out)
-    if not episode.situation:
-        raise UserError(f"the situation of {episode.id} is not known, so there is no scene to show")
-    rate = fps or 1.0 / episode.control_period_s
+    for episode in episodes:
+        if not episode.situation:
+            raise UserError(
+                f"the situation of {episode.id} is not known, so there is no scene to show"
+            )
+    rate = fps or 1.0 / episodes[0].control_period_s
+    task = make_task(config.task_called(episodes[0].task))
     with (
         closing(make_simulator(config.simulator.model_copy(update={"render": True}))) as simulator,
         video_file(out, rate) as write,
     ):
-        for frame in frames(episode, simulator, make_task(config.task_called(episode.task))):
-            write(frame)
-            on_frame()
+        for number, episode in enumerate(episodes, 1):
+            title = f"trial {number} of {len(episodes)}, " if len(episodes) > 1 else ""
+            for frame in frames(episode, simulator, task, title):
+                write(frame)
+                on_frame()
 
 
 def frames(episode: Episode, simulator: Simulator, task: Task) -> Iterator[Picture]:

@@ -60,9 +60,7 @@ def _safe(display: AbstractContextManager[Show]) -> Iterator[Show]:
 
 
 @contextmanager
-def _tables(
-    console: Console, meter: ProgressMeter, expected: Mapping[Role, int]
-) -> Iterator[Show]:
+def _tables(console: Console, meter: ProgressMeter, expected: Mapping[Role, int]) -> Iterator[Show]:
     with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
         yield lambda view: live.update(
             fitting_tables(view, console, meter.look(view), expected), refresh=True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -57,7 +57,7 @@ class ProgressMeter:
         """
         self._started_s = started_s
         self._clock = clock
-        self._last: tuple[float, Mapping[_Work, int]] | None = None
+        self._last: tuple[float, Mapping[_Work, int], Collection[_Work]] | None = None
         self._time_s: dict[_Work, float] = defaultdict(float)
         self._done: dict[_Work, int] = defaultdict(int)
 
@@ -71,12 +71,11 @@ class ProgressMeter:
             return Progress(elapsed_s)
         done = _done(view, learner)
         if self._last is not None:
-            before_s, before = self._last
-            for work in _present_work(view, learner):
+            before_s, before, works = self._last
+            for work in works:
                 self._time_s[work] += now_s - before_s
-            for work, count in done.items():
-                self._done[work] += max(0, count - before[work])
-        self._last = now_s, done
+                self._done[work] += max(0, done[work] - before[work])
+        self._last = now_s, done, list(_present_work(view, learner))
         left_s, at_least = self._left(_left(view, learner))
         return Progress(elapsed_s, left_s, at_least)
 

@@ -52,7 +52,7 @@ def fitting_tables(
     If there is too little room, the tables show fewer actors, policy versions and suites.
     """
     shown: RenderableType = Group()
-    for rows in range(max(1, console.height - 12), 0, -1):
+    for rows in range(max(0, console.height - 12), -1, -1):
         shown = run_tables(view, progress, expected, rows=rows, wide=console.width >= WIDE)
         # Live keeps the last line of the terminal for the cursor.
         if len(console.render_lines(shown)) < console.height:
@@ -74,7 +74,7 @@ def run_tables(
         view: the state.
         progress: how far it is in time.
         expected: number of processes by role that were started.
-        rows: no table has more rows.
+        rows: no table has more rows; with 0 there is only a line for each role.
         wide: show all columns; otherwise only those that fit into 80 columns.
     """
     parts: list[RenderableType] = [
@@ -83,13 +83,13 @@ def run_tables(
         _processes_table(view),
     ]
     actors = view.living(ActorMetrics)
-    if actors:
+    if actors and rows:
         parts += [Text(), _actors_table(actors, rows, wide=wide)]
-    if view.scores:
+    if view.scores and rows:
         parts += [Text(), _scores_table(view.scores, view.suites[0].trials, rows)]
         if why := reasons_words(view.scores[-1]):
             parts.append(_text(f"policy {view.scores[-1].version}, not precise: {why}"))
-    if len(view.suites) > 1:
+    if len(view.suites) > 1 and rows:
         parts += [Text(), _suites_table(view.suites, rows, wide=wide)]
     return Group(*parts, *_problems(view))
 

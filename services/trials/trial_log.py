@@ -144,15 +144,19 @@ class TrialLog:
         damaged: number of lines that could not be read; they stay in the file and are not counted.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, read_only: bool = False) -> None:
         """Open a trial log, or create it.
 
         A last line that is incomplete, because a process was killed, is dropped.
+
+        Args:
+            path: the file.
+            read_only: change nothing on disk, because another process may write to the file.
         """
         self._path = path
         self.damaged = 0
         self._outcomes: dict[tuple[str, int, str], dict[int, Outcome]] = defaultdict(dict)
-        if drop_unfinished_line(path):
+        if not read_only and drop_unfinished_line(path):
             LOG.warning("%s: dropped its last line, which was not finished", path)
         content = path.read_bytes() if path.exists() else b""
         for number, line in enumerate(content.splitlines(), 1):

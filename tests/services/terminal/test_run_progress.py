@@ -52,9 +52,7 @@ def test_what_is_left_follows_from_the_speed_of_each_kind_of_work() -> None:
     assert progress.left_s == pytest.approx(50 + 10 * 2)
     assert progress.at_least
 
-    correcting = replace(
-        coupled, stage=Stage.WAITING, epoch=40, round=1, corrections_total=5
-    )
+    correcting = replace(coupled, stage=Stage.WAITING, epoch=40, round=1, corrections_total=5)
     look(replace(coupled, epoch=40), 26, 30.0)
     look(correcting, 26, 0.0)
     look(replace(coupled, epoch=40, round=1), 36, 20.0)
@@ -63,7 +61,9 @@ def test_what_is_left_follows_from_the_speed_of_each_kind_of_work() -> None:
     assert not progress.at_least
 
     finished = replace(coupled, stage=Stage.FINISHED, epoch=60, round=1, policy_version=2)
-    counted = replace(evaluator, suites=(replace(evaluator.suites[0], policies=(score(2, 0, 10),)),))
+    counted = replace(
+        evaluator, suites=(replace(evaluator.suites[0], policies=(score(2, 0, 10),)),)
+    )
     clock.now_s += 20.0
     done = meter.look(view_of(finished, counted, actor))
     assert done.left_s is None, "nothing is left"
