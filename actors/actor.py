@@ -8,6 +8,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -69,6 +70,8 @@ OUTBOX_LIMIT: Final = 100
 """An actor plays no more for a receiver that owes it so many receipts."""
 POLICIES_KEPT: Final = 32
 """An actor keeps so many policies that are newer than the one it acts with."""
+UNSERVED_S: Final = 30.0
+"""How often to say that the run has neither a learner nor an evaluator."""
 COMPARE_AGAIN_S: Final = 5.0
 """How long to wait before the settings are compared again, if they differ."""
 PRACTICE_LIMIT: Final = 8
@@ -174,6 +177,7 @@ class Actor:
         self._bus = bus
         self._lifecycle = lifecycle
         self._agreement = Agreement(config, bus)
+        self._serving: set[tuple[Role, str]] = set()  # learners and evaluators that are there
         self._joined = threading.Event()  # set when a learner or evaluator has joined
         self._task = make_task(config.task)
         self._tasks = {self._task.name: self._task}
@@ -216,7 +220,7 @@ class Actor:
         """
         keys = self._bus.keys
         for role in ANSWERING:
-            self._bus.watch_presence(role, self._on_presence)
+            self._bus.watch_presence(role, partial(self._on_presence, role))
         self._agreement.check()
         outboxes = (self._sequences, self._rollouts)
         self._receipts.pass_on(self._bus.id, lambda: outboxes)
@@ -270,7 +274,10 @@ class Actor:
             first = self._first_trial()
             assignment = first or self._tutoring() or self._trial() or self._practice()
         if assignment is None:
-            self._lifecycle.waits_for(self._missing)
+            if self._unserved:
+                self._lifecycle.waits_for(self._unserved, log_again_s=UNSERVED_S)
+            else:
+                self._lifecycle.waits_for(self._missing)
             self._lifecycle.wait(IDLE_S)
             return
         self._lifecycle.waits_for("")
@@ -298,9 +305,19 @@ class Actor:
             return False
         return True
 
-    def _on_presence(self, _name: str, alive: bool) -> None:
+    def _on_presence(self, role: Role, name: str, alive: bool) -> None:
         if alive:
+            self._serving.add((role, name))
             self._joined.set()
+        else:
+            self._serving.discard((role, name))
+
+    @property
+    def _unserved(self) -> str:
+        """What is missing if neither a learner nor an evaluator is there; empty otherwise."""
+        if self._serving or self._bus.hub_is_away or self._lifecycle.paused:
+            return ""
+        return f"a learner or an evaluator of the run {self._bus.keys.run}: nobody serves it"
 
     @property
     def _missing(self) -> str:

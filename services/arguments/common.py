@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -11,9 +10,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from proto.config import Config, load_config
+from pydantic import ValidationError
+
+from proto.config import Config, HubConfig, load_config
 from proto.errors import UserError
-from proto.plain_text import plain_lines
 
 INTERRUPTED: Final = 130
 """Exit status of a command that Ctrl-C stopped."""
@@ -46,15 +46,37 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument(
         "--connect",
+        type=endpoint,
         metavar="tcp/HOST:PORT",
         help="endpoint of the hub; without it, hub.endpoint of the configuration",
     )
 
 
+def endpoint(text: str) -> str:
+    """`type=` of an argument that is the endpoint of a hub."""
+    try:
+        return HubConfig(endpoint=text).endpoint
+    except ValidationError:
+        host = text.rpartition("/")[2].partition(":")[0] or "HOST"
+        port = text.rpartition(":")[2] if re.search(r":\d+$", text) else "7447"
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not an endpoint: write tcp/HOST:PORT, such as tcp/{host}:{port}"
+        ) from None
+
+
 def add_process(parser: argparse.ArgumentParser) -> None:
-    """Add --config, --set, --connect and --id, for a process on the bus."""
+    """Add --config, --set, --connect, --id and options of the log, for a process on the bus."""
     add_connection(parser)
     parser.add_argument("--id", type=_id, help="name of this process on the bus")
+    amount = parser.add_mutually_exclusive_group()
+    amount.add_argument("-v", "--verbose", action="store_true", help="log details, too")
+    amount.add_argument("-q", "--quiet", action="store_true", help="log warnings and errors only")
+    parser.add_argument(
+        "--log-format",
+        choices=("text", "json"),
+        default="text",
+        help="json: one object for each record, with run, role and id",
+    )
 
 
 def listening_address(text: str) -> tuple[str, int]:
@@ -105,23 +127,6 @@ def config_of(arguments: argparse.Namespace) -> Config:
     if getattr(arguments, "connect", None) is not None:
         overrides.append(f"hub.endpoint={arguments.connect}")
     return load_config(arguments.config, overrides)
-
-
-def start_logging(role: str) -> None:
-    """Log to standard error; each line has the time and the role."""
-    handler = logging.StreamHandler()
-    handler.setFormatter(_PlainFormatter(f"%(asctime)s {role} %(levelname)s %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-
-
-class _PlainFormatter(logging.Formatter):
-    """Writes each record so that no text in it can look like another record.
-
-    The further lines of a message and of a stack trace are indented.
-    """
-
-    def format(self, record: logging.LogRecord) -> str:
-        return "\n    ".join(plain_lines(super().format(record)).split("\n"))
 
 
 def _id(text: str) -> str:

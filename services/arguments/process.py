@@ -18,7 +18,8 @@ from proto.lifecycle import Lifecycle
 from proto.periodic import every
 from proto.run_locks import own_id, single_process
 from proto.storage import DiskFullError, StorageError
-from services.arguments.common import config_of, start_logging
+from services.arguments.common import config_of
+from services.arguments.logs import ProcessLog
 
 LOG = logging.getLogger(__name__)
 
@@ -58,8 +59,9 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
     Raises:
         UserError: the configuration is not valid, or the run already has such a process.
     """
-    start_logging(role)
+    log = ProcessLog(role, arguments)
     config = config_of(arguments)
+    log.run = config.run.name
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
     told = ""
@@ -70,6 +72,7 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
                     _identity(config, role, arguments.id) as name,
                     _join(config, role, name, lifecycle) as bus,
                 ):
+                    log.id = name
                     if bus is not None:
                         make(config, bus, lifecycle).run()
             except (StorageError, PortInUseError) as error:

@@ -166,8 +166,8 @@ def _check_run_arguments(arguments: argparse.Namespace) -> None:
     given = [option for option, value in named.items() if value is not None]
     if given:
         raise UserError(
-            f"--run plays the trials of the run's own configuration; {given[0]} goes with"
-            f" --policy {arguments.run_folder}, which is the run's newest policy, or with --policy FILE"
+            f"--run plays the trials of the run's own configuration; {given[0]} goes with --policy:"
+            f" --policy {arguments.run_folder} is the run's newest policy"
         )
 
 

@@ -76,8 +76,17 @@ def write_video(
                 on_frame()
 
 
-def frames(episode: Episode, simulator: Simulator, task: Task) -> Iterator[Picture]:
-    """Yield one picture (480, 1280, 3) uint8, RGB, for each step of an episode of a task."""
+def frames(
+    episode: Episode, simulator: Simulator, task: Task, title: str = ""
+) -> Iterator[Picture]:
+    """Yield one picture (480, 1280, 3) uint8, RGB, for each step of an episode of a task.
+
+    Args:
+        episode: the episode.
+        simulator: renders it.
+        task: its task.
+        title: text at the beginning of the caption.
+    """
     staging = stage(task, episode.situation, episode.conditions, episode.seed)
     simulator.reset(staging.scene)
     for step in range(episode.steps):

@@ -13,7 +13,7 @@ from proto.config import Config, load_config
 from proto.errors import UserError
 from proto.suites import Suite
 from services.trials.success import Tally
-from services.trials.trial_log import TrialLog
+from services.trials.trial_log import CountedTrial, TrialLog
 from services.trials.trial_playing import LoggedPolicy
 
 
@@ -70,6 +70,21 @@ class RunFolder:
         """The counted trials of a policy version in a suite."""
         outcomes = self.log.outcomes(self.training, version, suite.name)
         return Tally.of(outcome for seed, outcome in outcomes.items() if seed in suite.test_seeds)
+
+    def trials(self, version: int, suite: Suite) -> list[CountedTrial]:
+        """The counted trials of a policy version in a suite, in the order of the file."""
+        return [
+            trial
+            for trial in self.log.trials(self.training, version, suite.name)
+            if trial.seed in suite.test_seeds
+        ]
+
+    @property
+    def changed_s(self) -> float:
+        """When a policy or a counted trial was written last (Unix time); 0.0 for never."""
+        newest = self.versions[-1:]
+        files = [trial_log_file(self.folder), *(policy_file(self.folder, n) for n in newest)]
+        return max((file.stat().st_mtime for file in files if file.is_file()), default=0.0)
 
     def best_version(self, suite: Suite) -> int | None:
         """The version with the most reliable success in a suite; None if no trial was counted.

@@ -155,7 +155,7 @@ class TrialLog:
         """
         self._path = path
         self.damaged = 0
-        self._outcomes: dict[tuple[str, int, str], dict[int, Outcome]] = defaultdict(dict)
+        self._trials: dict[tuple[str, int, str], dict[int, CountedTrial]] = defaultdict(dict)
         if not read_only and drop_unfinished_line(path):
             LOG.warning("%s: dropped its last line, which was not finished", path)
         content = path.read_bytes() if path.exists() else b""
@@ -191,18 +191,25 @@ class TrialLog:
 
     def versions(self, run_id: str, suite: str = UNLEARNED) -> list[int]:
         """Return the policy versions of a training with counted trials in a suite, oldest first."""
-        keys = list(self._outcomes)  # a copy, because another thread may add to it
+        keys = list(self._trials)  # a copy, because another thread may add to it
         return sorted(version for run, version, name in keys if (run, name) == (run_id, suite))
 
     def tried_versions(self, run_id: str) -> list[int]:
         """Return the policy versions of a training with trials in any suite, oldest first."""
-        return sorted({version for run, version, _ in list(self._outcomes) if run == run_id})
+        return sorted({version for run, version, _ in list(self._trials) if run == run_id})
 
     def outcomes(
         self, run_id: str, policy_version: int, suite: str = UNLEARNED
     ) -> Mapping[int, Outcome]:
         """Return the outcomes of a policy version in a suite by the trial's seed."""
-        return dict(self._outcomes.get((run_id, policy_version, suite), {}))
+        counted = self._trials.get((run_id, policy_version, suite), {})
+        return {seed: trial.outcome for seed, trial in list(counted.items())}
+
+    def trials(
+        self, run_id: str, policy_version: int, suite: str = UNLEARNED
+    ) -> list[CountedTrial]:
+        """Return the counted trials of a policy version in a suite, in the order of the file."""
+        return list(self._trials.get((run_id, policy_version, suite), {}).values())
 
     def _add(self, trial: CountedTrial) -> bool:
         if trial.seed in self.outcomes(trial.run_id, trial.policy_version, trial.suite):
@@ -211,10 +218,8 @@ class TrialLog:
         return self._count(trial)
 
     def _count(self, trial: CountedTrial) -> bool:
-        outcomes = self._outcomes[trial.run_id, trial.policy_version, trial.suite]
-        new = trial.seed not in outcomes
-        outcomes.setdefault(trial.seed, trial.outcome)
-        return new
+        counted = self._trials[trial.run_id, trial.policy_version, trial.suite]
+        return counted.setdefault(trial.seed, trial) is trial
 
     def _read(self, line: bytes, number: int) -> None:
         try:

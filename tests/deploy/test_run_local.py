@@ -316,5 +316,5 @@ def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> N
     assert "policy 4, 10 of 10 trials counted" in output
     assert not processes_that_name(str(tmp_path))
     counted = (run / "evaluation" / "trials.jsonl").read_text().splitlines()
-    recorded = {path.stem for path in (run / "rollouts").glob("*.mcap")}
+    recorded = {path.stem.rpartition("_")[2] for path in (run / "rollouts").glob("*.mcap")}
     assert {json.loads(line)["episode"] for line in counted} <= recorded

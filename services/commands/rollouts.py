@@ -1,0 +1,95 @@
+"""`vmdnn rollouts`: the recorded rollouts of a run, to find those that one wants to look at."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from proto.episode import NO_FAILURE, Kind
+from proto.errors import UserError
+from proto.plain_text import plain
+from proto.recordings.episodes import RecordingHead, read_head
+from proto.variables import situation_text
+from services.arguments.common import positive
+from services.terminal.console import make_console
+from services.terminal.run_words import outcome_words
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("run_folder", type=Path, metavar="RUN", help="folder of a run, or of files")
+    parser.add_argument(
+        "--failed", action="store_true", help="only rollouts that were not a precise success"
+    )
+    parser.add_argument("--reason", help="only rollouts with this outcome, such as not_lifted")
+    parser.add_argument(
+        "--kind",
+        choices=[kind.value for kind in Kind],
+        help="only rollouts that were played for this reason",
+    )
+    parser.add_argument("--policy-version", type=positive, help="only rollouts of this version")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """List the rollouts in the order in which they were played."""
+    folder = arguments.run_folder / "rollouts"
+    folder = folder if folder.is_dir() else arguments.run_folder
+    files = sorted(folder.glob("*.mcap"))
+    if not files:
+        raise UserError(f"{folder} holds no recording (*.mcap)")
+    console = make_console(stderr=True)
+    found: list[tuple[Path, RecordingHead]] = []
+    for file in files:
+        try:
+            head = read_head(file)
+        except UserError as error:
+            console.print(plain(f"left out: {error}"))
+            continue
+        if _is_wanted(head, arguments):
+            found.append((file, head))
+    found.sort(key=lambda each: each[1].started_s or 0.0)
+    if arguments.json:
+        print(json.dumps([_numbers(*each) for each in found], indent=2))
+    else:
+        make_console().print(_table(found, folder))
+    return 0
+
+
+def _is_wanted(head: RecordingHead, arguments: argparse.Namespace) -> bool:
+    return (
+        (not arguments.failed or head.reason != NO_FAILURE)
+        and arguments.reason in (None, head.reason, outcome_words(head.reason))
+        and arguments.kind in (None, head.kind.value)
+        and arguments.policy_version in (None, head.policy_version)
+    )
+
+
+def _numbers(file: Path, head: RecordingHead) -> dict[str, Any]:
+    return {"file": str(file), **asdict(head)}
+
+
+def _table(found: list[tuple[Path, RecordingHead]], folder: Path) -> Table:
+    table = Table(caption=f"{len(found)} rollouts in {folder}; vmdnn replay FILE --out video.mp4")
+    for heading in ("played", "kind", "policy", "outcome", "situation", "file"):
+        table.add_column(heading, overflow="fold", no_wrap=heading in ("played", "kind"))
+    for file, head in found:
+        started_s = head.started_s
+        clock = (
+            "" if started_s is None else time.strftime("%m-%d %H:%M:%S", time.localtime(started_s))
+        )
+        table.add_row(
+            clock,
+            head.kind.value,
+            str(head.policy_version or plain(head.policy)),
+            plain(outcome_words(head.reason)),
+            plain(situation_text(head.situation)),
+            plain(file.name),
+        )
+    return table
