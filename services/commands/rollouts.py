@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Iterator
 from dataclasses import asdict
+from itertools import chain, starmap
 from pathlib import Path
 from typing import Any
-
-from rich.table import Table
 
 from proto.episode import NO_FAILURE, Kind
 from proto.errors import UserError
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             head = read_head(file)
         except UserError as error:
-            console.print(plain(f"left out: {error}"))
+            console.print(plain(f"left out: {error}"), soft_wrap=True)
             continue
         if _is_wanted(head, arguments):
             found.append((file, head))
@@ -58,7 +58,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print(json.dumps([_numbers(*each) for each in found], indent=2))
     else:
-        make_console().print(_table(found, folder))
+        for line in chain.from_iterable(starmap(_lines, found)):
+            print(plain(line))
     return 0
 
 
@@ -75,21 +76,12 @@ def _numbers(file: Path, head: RecordingHead) -> dict[str, Any]:
     return {"file": str(file), **asdict(head)}
 
 
-def _table(found: list[tuple[Path, RecordingHead]], folder: Path) -> Table:
-    table = Table(caption=f"{len(found)} rollouts in {folder}; vmdnn replay FILE --out video.mp4")
-    for heading in ("played", "kind", "policy", "outcome", "situation", "file"):
-        table.add_column(heading, overflow="fold", no_wrap=heading in ("played", "kind"))
-    for file, head in found:
-        started_s = head.started_s
-        clock = (
-            "" if started_s is None else time.strftime("%m-%d %H:%M:%S", time.localtime(started_s))
-        )
-        table.add_row(
-            clock,
-            head.kind.value,
-            str(head.policy_version or plain(head.policy)),
-            plain(outcome_words(head.reason)),
-            plain(situation_text(head.situation)),
-            plain(file.name),
-        )
-    return table
+def _lines(file: Path, head: RecordingHead) -> Iterator[str]:
+    """Yield what a rollout was, its situation, and its file, ready to be copied."""
+    played = "time unknown       "
+    if head.started_s is not None:
+        played = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(head.started_s))
+    policy = f"policy {head.policy_version}" if head.policy_version else head.policy
+    yield f"{played}  {head.kind} of {policy}: {outcome_words(head.reason)}"
+    yield f"    {situation_text(head.situation)}"
+    yield f"    {file}"

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rich.box import SIMPLE
 from rich.table import Table
 
 from proto.errors import UserError
@@ -16,7 +17,7 @@ from proto.plain_text import plain
 from services.terminal.console import make_console
 from services.terminal.rates import rate_text
 from services.trials.run_folder import RunFolder
-from services.trials.success import READINGS, Tally
+from services.trials.success import Tally
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             found.append(_Found.of(RunFolder.open(file.parent)))
         except UserError as error:
-            console.print(plain(f"{file.parent} is left out: {error}"))
+            console.print(plain(f"{file.parent} is left out: {error}"), soft_wrap=True)
     found.sort(key=lambda each: -each.changed_s)
     if arguments.json:
         print(json.dumps([each.as_json() for each in found], indent=2))
@@ -89,21 +90,21 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _table(found: list[_Found]) -> Table:
-    table = Table(caption="best: the version with the most reliable success in the first suite, %")
-    for heading in ("run", "task", "versions", "best", "trials", *READINGS, "last change"):
-        left = heading in ("run", "task", "last change")
-        table.add_column(heading, justify="left" if left else "right")
+    table = Table(
+        box=SIMPLE,
+        padding=(0, 1, 0, 0),
+        caption="best: the version with the most reliable success in the first suite",
+    )
+    for heading in ("run", "versions", "best", "trials", "strict", "precise", "last change"):
+        table.add_column(heading, justify="left" if heading == "run" else "right")
     for each in found:
-        tally = each.tally
-        rates = (rate_text(tally.rate(reading), digits=0) for reading in READINGS)
+        best, tally = each.best, each.tally
+        rates = [rate_text(tally.rate(reading), digits=0) for reading in ("strict", "precise")]
+        changed = time.strftime("%m-%d %H:%M", time.localtime(each.changed_s))
         table.add_row(
             plain(each.run.config.run.name),
-            plain(each.run.config.task.name),
             str(each.newest),
-            *(("", "0") if each.best is None else (str(each.best), str(tally.trials))),
-            *(("",) * len(READINGS) if each.best is None else rates),
-            time.strftime("%Y-%m-%d %H:%M", time.localtime(each.changed_s))
-            if each.changed_s
-            else "",
+            *(("", "", "", "") if best is None else (str(best), str(tally.trials), *rates)),
+            changed if each.changed_s else "",
         )
     return table

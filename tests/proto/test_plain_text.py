@@ -57,7 +57,7 @@ def test_a_view_shows_hostile_texts_as_texts(text: str) -> None:
     console = make_console()
     console.file = io.StringIO()
     console.print(run_tables(hostile_view(text)))
-    with display(console) as show:
+    with display(console, ProgressMeter(), {}) as show:
         show(hostile_view(text))
     assert "\x1b" not in console.file.getvalue()
     assert plain(run_line(hostile_view(text))).isprintable()

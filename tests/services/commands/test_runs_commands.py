@@ -1,4 +1,4 @@
-"""`vmdnn runs`, `rollouts`, `compare-runs` and `evaluate --run` show what runs have left on disk."""
+"""`vmdnn runs`, `rollouts`, `compare-runs` and `evaluate --run`: what runs have left on disk."""
 
 from __future__ import annotations
 

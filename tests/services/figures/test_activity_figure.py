@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -46,8 +47,12 @@ def test_one_command_draws_two_rollouts_and_prints_their_difference(
     assert {name: len(units) for name, units in numbers["units"].items()} == {
         "mstnn_fast": UNITS_SHOWN,
         "pfc": 20,
-        "mtrnn_fast": UNITS_SHOWN,
+        "mtrnn_slow": 30,
+        "mtrnn_fast": 50,
     }
+    per_map = UNITS["mstnn_fast"] // 3
+    maps = Counter(unit // per_map for unit in numbers["units"]["mstnn_fast"])
+    assert maps == dict.fromkeys(range(3), UNITS_SHOWN // 3), "as many of each map"
     first = numbers["rollouts"][0]
     assert first["situation"]["object_yaw_deg"] == 44
     assert [episode.phases[start] for start in first["phase_starts"]] == list(range(8))
