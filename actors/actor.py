@@ -292,6 +292,11 @@ class Actor:
             return
         self._episodes += 1
         self._last = episode
+        LOG.debug(
+            "played %s with the seed %d by %s, version %d: %s",
+            *(episode.kind, episode.seed, episode.policy, episode.policy_version),
+            episode.outcome.reason,
+        )
 
     def _agrees(self) -> bool:
         """Whether the settings still fit the run; compared when a learner or evaluator joined."""

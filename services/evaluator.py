@@ -199,6 +199,7 @@ class Evaluator:
             return None
         _, name, seed = taken
         self._asked.give(policy, (name, seed), request.actor)
+        LOG.debug("policy %d: trial %d of %s goes to %s", policy[1], seed, name, request.actor)
         return Trial(seed, self._suites[name].conditions(seed))
 
     def _wanted(self, policy: PolicyKey, player: Player) -> Iterator[TrialKey]:

@@ -112,7 +112,8 @@ def _processes_table(view: RunView) -> Table:
         table.add_row("evaluator", _text(evaluator_words(view, evaluator)))
     for recorder in view.living(RecorderMetrics):
         table.add_row("recorder", _text(recorder_words(recorder)))
-    table.add_row("actors", _text(actors_words(view.living(ActorMetrics))))
+    actors = view.living(ActorMetrics)
+    table.add_row("actors", _text(actors_words(actors) if actors else "none yet"))
     return table
 
 

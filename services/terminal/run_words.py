@@ -73,8 +73,10 @@ def starting_words(view: RunView, expected: Mapping[Role, int]) -> str:
 
     Args:
         view: the state of the run.
-        expected: number of processes by role that were started.
+        expected: number of processes by role that were started; empty if this is not known.
     """
+    if not expected and not view.metrics:
+        return "no process of this run is there"
     known = [role for role, _ in {*view.metrics, *view.vanished_s}]
     missing = {role: count - known.count(role) for role, count in expected.items()}
     names = [

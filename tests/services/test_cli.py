@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 from importlib.metadata import version
 from pathlib import Path
@@ -101,4 +102,4 @@ def test_completion_knows_every_command(capsys: pytest.CaptureFixture[str], tmp_
         ["bash", "-c", f"source {script}; {typed}"], capture_output=True, text=True, check=True
     )
     assert {"evaluate", "evaluator"} <= set(found.stdout.split())
-    assert set(COMMANDS) <= set(script.read_text().replace("'", " ").replace('"', " ").split())
+    assert set(COMMANDS) <= set(re.findall(r"[\w-]+", script.read_text()))

@@ -105,7 +105,7 @@ def test_the_stage_of_the_learner_is_shown(given: dict[str, Any], said: str) -> 
 
 
 def test_an_empty_view_can_be_shown() -> None:
-    assert run_line(view_of()) == "no actor"
+    assert run_line(view_of()) == "no process of this run is there | no actor"
     assert RUN in shown(view_of())
 
 
