@@ -10,6 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from textwrap import wrap
 from typing import Final
 
 from rich.console import Console
@@ -39,6 +40,7 @@ from services.terminal.run_progress import ProgressMeter
 from services.terminal.run_words import duration_words, success_words
 
 DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
+_NARROW: Final = 79
 FEW_CASES: Final = 10
 """With so few tutored cases a run teaches nothing, and says so at its end."""
 VMDNN: Final = str(Path(sys.executable).with_name("vmdnn"))
@@ -252,7 +254,17 @@ def summary(view: RunView, config: Config, wall_s: float) -> str:
         f"files: {config.run_folder}/ with config.yaml, tutoring, checkpoints, policies, "
         "rollouts, evaluation, logs",
     ]
-    return "\n".join(lines)
+    return "\n".join(part for line in lines for part in _wrapped(line))
+
+
+def _wrapped(line: str) -> list[str]:
+    """Break a line between words where a narrow terminal would break it anywhere.
+
+    Indented lines stay whole, because they are commands to be copied.
+    """
+    if line.startswith(" "):
+        return [line]
+    return wrap(line, _NARROW, break_long_words=False, break_on_hyphens=False)
 
 
 def _untried_lines(view: RunView, config: Config) -> list[str]:
@@ -272,7 +284,8 @@ def _untried_lines(view: RunView, config: Config) -> list[str]:
     verb = "has" if len(fewer) == 1 else "have"
     return [
         f"{words} {verb} fewer than {suite.trials} trials, because a newer version came first;"
-        f" to play the rest: vmdnn evaluate --run {config.run_folder} --policy-version all"
+        " to play the rest:",
+        f"  vmdnn evaluate --run {config.run_folder} --policy-version all",
     ]
 
 
@@ -291,13 +304,18 @@ def _expectation_lines(config: Config) -> list[str]:
 def _next_steps(task: str) -> list[str]:
     """Return commands that show success in a task."""
     trained = f"{PREFIX}{task}"
-    steps = [f"to train a good policy, tutor all cases: deploy/run_local.sh --config {task}"]
+    steps = []
     if trained in pretrained_names():
-        steps.append(
-            f"to see a trained policy now: vmdnn evaluate --policy {trained} --task {task}"
-            " --trials 3 --video trials.mp4"
-        )
-    return steps if task in built_in_names() else steps[1:]
+        steps += [
+            "to see a trained policy now:",
+            f"  vmdnn evaluate --policy {trained} --task {task} --trials 3 --video trials.mp4",
+        ]
+    if task in built_in_names():
+        steps += [
+            "to train a good policy, tutor all cases:",
+            f"  deploy/run_local.sh --config {task}",
+        ]
+    return steps
 
 
 def _expected(actors: Mapping[str, int]) -> Mapping[Role, int]:

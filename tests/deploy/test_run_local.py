@@ -10,13 +10,15 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from ports import free_endpoint
 from processes import eventually
+from run_metrics import EVALUATOR, LEARNER, score, view_of
 
-from deploy.run_local import DEFAULT_CONFIG, actors_of, check_actors, main, programs
+from deploy.run_local import DEFAULT_CONFIG, actors_of, check_actors, main, programs, summary
 from proto.config import Config, LearnerConfig, load_config
 from proto.run_locks import owned_run
 
@@ -216,6 +218,21 @@ def test_actors_from_elsewhere_are_believed() -> None:
     check_actors(actors_of({"sapien": 1, "other": 0}, config), config)
     check_actors(actors_of(0, config), config)
     assert actors_of(3, config) == {"sapien": 3}
+
+
+def test_the_summary_says_what_to_expect_and_what_is_missing() -> None:
+    suite = replace(EVALUATOR.suites[0], trials=10, policies=(score(1, 0, 2), score(4, 0, 10)))
+    view = view_of(replace(LEARNER, policy_version=4), replace(EVALUATOR, suites=(suite,)))
+    told = summary(view, load_config(SMOKE), 301.0)
+    assert "4 policy versions in 5 min 1 s" in told
+    assert "3 earlier versions have fewer than 10 trials" in told
+    assert "  vmdnn evaluate --run runs/smoke --policy-version all\n" in told
+    assert "no success is expected here: 3 tutored cases" in told
+    assert "  vmdnn evaluate --policy pretrained:experiment1" in told
+    prose = [line for line in told.splitlines() if not line.startswith(" ")]
+    assert max(map(len, prose)) < 80
+    whole = summary(view, load_config(DEFAULT_CONFIG), 301.0)
+    assert "expected" not in whole
 
 
 def test_a_run_that_is_being_played_is_not_touched_by_a_second_start(
