@@ -549,3 +549,14 @@ def test_a_rollout_stays_until_the_recorder_has_it_too(
     assert (metrics.outbox, metrics.waiting_for) == (1, "receipts of the recorder")
     setup.recorders.append(Role.RECORDER)
     setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
+
+
+def test_an_actor_of_a_run_that_nobody_serves_says_so(tmp_path: Path) -> None:
+    endpoint, log = free_endpoint(), tmp_path / "actor.log"
+    words = (
+        *("--connect", endpoint, "--set", f"run.folder={tmp_path}", "--set", "run.name=lonely"),
+        *("--set", "simulator.render=false"),
+    )
+    with listening_hub(endpoint), vmdnn("actor", *words, log=log):
+        said = "waiting for a learner or an evaluator of the run lonely: nobody serves it (since 5"
+        eventually(lambda: said in log.read_text(), "it says that nobody serves the run")
