@@ -34,7 +34,7 @@ class ProcessLog:
         if arguments.log_format == "json":
             handler.setFormatter(_JsonFormatter(self))
         else:
-            handler.setFormatter(_PlainFormatter(f"%(asctime)s {role} %(levelname)s %(message)s"))
+            handler.setFormatter(_plain_formatter(role))
         level = logging.INFO
         if arguments.quiet:
             level = logging.WARNING
@@ -42,6 +42,21 @@ class ProcessLog:
         if arguments.verbose:  # details of our own modules, not of libraries
             for package in ("proto", "learner", "actors", "services"):
                 logging.getLogger(package).setLevel(logging.DEBUG)
+
+
+def start_logging(name: str) -> None:
+    """Log to standard error, for a command that is no process of a run.
+
+    Args:
+        name: stands in each line, beside the time.
+    """
+    handler = logging.StreamHandler()
+    handler.setFormatter(_plain_formatter(name))
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
+
+
+def _plain_formatter(name: str) -> logging.Formatter:
+    return _PlainFormatter(f"%(asctime)s {name} %(levelname)s %(message)s")
 
 
 class _PlainFormatter(logging.Formatter):
