@@ -16,7 +16,7 @@ from proto.episode import Episode
 from proto.errors import UserError
 from proto.recordings.episodes import read_episode, write_episode
 from services.cli import main
-from services.figures.activity import UNITS_SHOWN, difference_by_phase, draw
+from services.figures.activity import SUBNETS, UNITS_SHOWN, difference_by_phase, draw
 from services.figures.rollouts import Activity, activity_of
 
 UNITS = {"mstnn_fast": 1188, "mstnn_slow": 336, "pfc": 20, "mtrnn_slow": 30, "mtrnn_fast": 50}
@@ -108,12 +108,11 @@ def test_the_difference_of_rollouts_is_computed_for_each_phase(
     make_episode: Callable[..., Episode],
 ) -> None:
     episode = make_episode(6, phases=np.array([1, 1, 2, 2, 3, 3], np.uint8))
-    names = ("mstnn_fast", "pfc", "mtrnn_fast")
-    still = {name: np.zeros((6, 4), np.float32) for name in names}
-    moved = {name: np.zeros((6, 4), np.float32) for name in names}
+    still = {name: np.zeros((6, 4), np.float32) for name in SUBNETS}
+    moved = {name: np.zeros((6, 4), np.float32) for name in SUBNETS}
     moved["pfc"][2:4] = 0.5
     apart = difference_by_phase(Activity(episode, still), Activity(episode, moved))
-    assert apart == {"mstnn_fast": [0, 0, 0], "pfc": [0, 0.5, 0], "mtrnn_fast": [0, 0, 0]}
+    assert apart == {**dict.fromkeys(SUBNETS, [0, 0, 0]), "pfc": [0, 0.5, 0]}
 
 
 def test_columns_say_what_differs_and_subtasks_have_names(
@@ -127,7 +126,7 @@ def test_columns_say_what_differs_and_subtasks_have_names(
         make_episode(6, phases=phases, phase_names=names, situation={**situation, **changed})
         for changed in ({}, {"indicated_x_m": "0.07", "indicated_y_m": 0.26})
     ]
-    states = {name: np.zeros((6, 4), np.float32) for name in ("mstnn_fast", "pfc", "mtrnn_fast")}
+    states = {name: np.zeros((6, 4), np.float32) for name in SUBNETS}
     figure = draw([Activity(episode, states) for episode in episodes])
     titles = [axes.get_title() for axes in figure.axes[:2]]
     assert titles == [
