@@ -112,7 +112,7 @@ def test_the_difference_of_rollouts_is_computed_for_each_phase(
     moved = {name: np.zeros((6, 4), np.float32) for name in SUBNETS}
     moved["pfc"][2:4] = 0.5
     apart = difference_by_phase(Activity(episode, still), Activity(episode, moved))
-    assert apart == {**dict.fromkeys(SUBNETS, [0, 0, 0]), "pfc": [0, 0.5, 0]}
+    assert apart == {name: [0, 0.5 * (name == "pfc"), 0] for name in SUBNETS}
 
 
 def test_columns_say_what_differs_and_subtasks_have_names(
