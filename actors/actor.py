@@ -6,8 +6,10 @@ import logging
 import secrets
 import threading
 import time
+from collections import deque
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final
 from zlib import crc32
 
@@ -73,6 +75,10 @@ OUTBOX_LIMIT: Final = 100
 """An actor plays no more for a receiver that owes it so many receipts."""
 REPORT_WITHIN_S: Final = 15.0
 """How long an actor waits at its start for receipts of reports that its predecessor died."""
+POLICIES_KEPT: Final = 32
+"""An actor keeps so many policies that are newer than the one it acts with."""
+UNSERVED_S: Final = 30.0
+"""How often to say that the run has neither a learner nor an evaluator."""
 COMPARE_AGAIN_S: Final = 5.0
 """How long to wait before the settings are compared again, if they differ."""
 PRACTICE_LIMIT: Final = 8
@@ -203,6 +209,7 @@ class Actor:
         self._lifecycle = lifecycle
         self._drain_s = drain_s
         self._agreement = Agreement(config, bus)
+        self._serving: set[tuple[Role, str]] = set()  # learners and evaluators that are there
         self._joined = threading.Event()  # set when a learner or evaluator has joined
         self._task = make_task(config.task)
         self._tasks = {self._task.name: self._task}
@@ -226,7 +233,9 @@ class Actor:
         )
         self._policy: NetworkPolicy | None = None
         self._policy_run = ""
-        self._offered: _Offer | None = None
+        # With first trials every version; otherwise only the newest.
+        kept = POLICIES_KEPT if config.evaluator.first_trials else 1
+        self._offers: deque[_Offer] = deque(maxlen=kept)  # newer than the policy, oldest first
         self._offering = threading.Lock()
         self._pace = Pace()
         self._episodes = 0
@@ -243,7 +252,7 @@ class Actor:
         """
         keys = self._bus.keys
         for role in ANSWERING:
-            self._bus.watch_presence(role, self._on_presence)
+            self._bus.watch_presence(role, partial(self._on_presence, role))
         self._agreement.check()
         self._receipts.pass_on(self._bus.id, lambda: self._outboxes)
         self._bus.subscribe_newest(
@@ -333,10 +342,13 @@ class Actor:
     def _play_next(self) -> None:
         assignment = None
         if not self._lifecycle.paused and self._agrees():
-            self._take_newest_policy()
-            assignment = self._tutoring() or self._trial() or self._practice()
+            first = self._first_trial()
+            assignment = first or self._tutoring() or self._trial() or self._practice()
         if assignment is None:
-            self._lifecycle.waits_for(self._missing)
+            if self._unserved:
+                self._lifecycle.waits_for(self._unserved, log_again_s=UNSERVED_S)
+            else:
+                self._lifecycle.waits_for(self._missing)
             self._lifecycle.wait(IDLE_S)
             return
         self._lifecycle.waits_for("")
@@ -351,6 +363,11 @@ class Actor:
             return
         self._episodes += 1
         self._last = episode
+        LOG.debug(
+            "played %s with the seed %d by %s, version %d: %s",
+            *(episode.kind, episode.seed, episode.policy, episode.policy_version),
+            episode.outcome.reason,
+        )
 
     def _agrees(self) -> bool:
         """Whether the settings still fit the run; compared when a learner or evaluator joined."""
@@ -364,9 +381,19 @@ class Actor:
             return False
         return True
 
-    def _on_presence(self, _name: str, alive: bool) -> None:
+    def _on_presence(self, role: Role, name: str, alive: bool) -> None:
         if alive:
+            self._serving.add((role, name))
             self._joined.set()
+        else:
+            self._serving.discard((role, name))
+
+    @property
+    def _unserved(self) -> str:
+        """What is missing if neither a learner nor an evaluator is there; empty otherwise."""
+        if self._serving or self._bus.hub_is_away or self._lifecycle.paused:
+            return ""
+        return f"a learner or an evaluator of the run {self._bus.keys.run}: nobody serves it"
 
     @property
     def _missing(self) -> str:
@@ -387,7 +414,7 @@ class Actor:
             return f"an answer of the {' and the '.join(silent)}"
         if missing := sorted(set().union(*(each.missing for each in self._outboxes))):
             return f"receipts of the {' and the '.join(missing)}"
-        return "something to play" if self._policy else "something to play, or a policy"
+        return "something to play" if self._policy else "the first policy"
 
     def _deliver(self, key: str, wire: Wire) -> None:
         """Send what is in the outbox, also if it was kept while the run had another name."""
@@ -620,7 +647,7 @@ class Actor:
         return self._sequences, Role.LEARNER
 
     def _on_policy(self, message: PolicyVersion) -> None:
-        """Keep the newest policy of this run until the next episode begins."""
+        """Keep a newer policy of this run until the next episode begins."""
         try:
             offered = _Offer(message.run_id, message.version, policy_of(message, self._config))
         except UserError as error:
@@ -628,15 +655,31 @@ class Actor:
             LOG.warning("policy %d cannot be used: %s", message.version, plain(error))
             return
         with self._offering:
-            waiting = self._offered
+            waiting = self._offers[-1] if self._offers else None
             if waiting is None or offered.is_newer_than(waiting.run_id, waiting.version):
-                self._offered = offered
+                if waiting is not None and offered.run_id != waiting.run_id:
+                    self._offers.clear()
+                self._offers.append(offered)
 
-    def _take_newest_policy(self) -> None:
+    def _first_trial(self) -> Assignment | None:
+        """Take the newer policies, one after the other, until there is no newer one.
+
+        If `evaluator.first_trials` is set, the evaluator is asked first whether it lacks first
+        trials of the policy at hand; one of them is returned before a newer policy is taken.
+        """
+        while self._offers:
+            if self._policy is not None and self._config.evaluator.first_trials:
+                trial = self._trial()
+                if trial is not None:
+                    return trial
+            self._take_next_policy()
+        return None
+
+    def _take_next_policy(self) -> None:
         with self._offering:
-            offered, self._offered = self._offered, None
+            offered = self._offers.popleft()
         held = self._policy.version if self._policy else 0
-        if offered is None or not offered.is_newer_than(self._policy_run, held):
+        if not offered.is_newer_than(self._policy_run, held):
             return
         try:
             policy = NetworkPolicy(offered.checkpoint, "the policy")

@@ -7,14 +7,16 @@ import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from textwrap import wrap
 from typing import Final
 
 from rich.console import Console
 
 from deploy.processes import BAD_INPUT, programs
 from deploy.supervision import ProcessFailedError, Supervisor, SupervisorEndedError, Watchdog
+from learner.pretrained import PREFIX, pretrained_names
 from proto.bus import Bus, NoHubError, open_bus
 from proto.config import Config, load_config
 from proto.errors import UserError
@@ -27,14 +29,18 @@ from proto.permissions import Holder
 from proto.plain_text import plain_lines
 from proto.run_locks import owned_run
 from proto.security import certificate_for
-from services.arguments.common import config_argument, integer
+from services.arguments.common import built_in_names, config_argument, integer
 from services.arguments.process import PRIVATE
 from services.board import Board, RunView
 from services.machine.ports import port_trouble
-from services.terminal.display import display
-from services.terminal.run_words import success_words
+from services.terminal.display import Show, display
+from services.terminal.run_progress import ProgressMeter
+from services.terminal.run_words import duration_words, success_words
 
 DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
+_NARROW: Final = 79
+FEW_CASES: Final = 10
+"""With so few tutored cases a run teaches nothing, and says so at its end."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -173,7 +179,8 @@ def _run(config: Config, actors: Mapping[str, int], console: Console) -> None:
             if bus is not None:
                 for program in supervisor.programs[1:]:
                     supervisor.start(program.name)
-                view = _follow(Board(bus), watchdog, lifecycle, console)
+                show = display(console, ProgressMeter(started_s=started_s), _expected(actors))
+                view = _follow(Board(bus), watchdog, lifecycle, show)
         console.print("stopping", highlight=False)
     if view is not None:
         text = summary(view, config, time.monotonic() - started_s)
@@ -206,20 +213,92 @@ def check_can_be_done(config: Config) -> None:
 
 def summary(view: RunView, config: Config, wall_s: float) -> str:
     """Return the result of a run in a few lines."""
-    minutes, seconds = divmod(round(wall_s), 60)
     lines = [
-        f"run {config.run.name}: {view.policy_version} policy versions"
-        f" in {minutes} min {seconds} s",
+        f"run {config.run.name}: {view.policy_version} policy versions in {duration_words(wall_s)}",
         *_suite_lines(view.suites),
+        *_untried_lines(view, config),
+        *_expectation_lines(config),
         f"files: {config.run_folder}/ with config.yaml, tutoring, checkpoints, policies, "
         "rollouts, evaluation, logs",
     ]
-    return "\n".join(lines)
+    return "\n".join(part for line in lines for part in _wrapped(line))
 
 
-def _follow(board: Board, watchdog: Watchdog, lifecycle: Lifecycle, console: Console) -> RunView:
+def _wrapped(line: str) -> list[str]:
+    """Break a line between words where a narrow terminal would break it anywhere.
+
+    Indented lines stay whole, because they are commands to be copied.
+    """
+    if line.startswith(" "):
+        return [line]
+    return wrap(line, _NARROW, break_long_words=False, break_on_hyphens=False)
+
+
+def _untried_lines(view: RunView, config: Config) -> list[str]:
+    """Say which policy versions before the newest one have fewer trials, and why."""
+    if not view.suites or not view.policy_version:
+        return []
+    suite = view.suites[0]
+    counted = {score.version: score.trials for score in suite.policies}
+    fewer = [
+        version
+        for version in range(1, view.policy_version)
+        if counted.get(version, 0) < suite.trials
+    ]
+    if not fewer:
+        return []
+    words = f"version {fewer[0]}" if len(fewer) == 1 else f"{len(fewer)} earlier versions"
+    verb = "has" if len(fewer) == 1 else "have"
+    return [
+        f"{words} {verb} fewer than {suite.trials} trials, because a newer version came first;"
+        " to play the rest:",
+        f"  vmdnn evaluate --run {config.run_folder} --policy-version all",
+    ]
+
+
+def _expectation_lines(config: Config) -> list[str]:
+    """Say that little success is to be expected of a run with few tutored cases; and what next."""
+    cases = config.learner.cases
+    if cases is None or len(cases) > FEW_CASES:
+        return []
+    return [
+        f"no success is expected here: {len(cases)} tutored cases and {config.learner.epochs}"
+        " epochs show that everything works, they do not teach the task",
+        *_next_steps(config.task.name),
+    ]
+
+
+def _next_steps(task: str) -> list[str]:
+    """Return commands that show success in a task."""
+    trained = f"{PREFIX}{task}"
+    steps = []
+    if trained in pretrained_names():
+        steps += [
+            "to see a trained policy now:",
+            f"  vmdnn evaluate --policy {trained} --task {task} --trials 3 --video trials.mp4",
+        ]
+    if task in built_in_names():
+        steps += [
+            "to train a good policy, tutor all cases:",
+            f"  deploy/run_local.sh --config {task}",
+        ]
+    return steps
+
+
+def _expected(actors: Mapping[str, int]) -> Mapping[Role, int]:
+    """Return the number of processes by role that are started, besides the hub."""
+    others = dict.fromkeys((Role.LEARNER, Role.EVALUATOR, Role.RECORDER), 1)
+    return {**others, Role.ACTOR: sum(actors.values())}
+
+
+def _follow(
+    board: Board,
+    watchdog: Watchdog,
+    lifecycle: Lifecycle,
+    showing: AbstractContextManager[Show],
+) -> RunView:
     """Show the state of the run until it is done or is to stop; return the last state."""
-    with display(console) as show:
+    with showing as show:
         while True:
             view = board.view()
             show(view)
@@ -263,6 +342,8 @@ def _score_lines(suite: SuiteScore) -> list[str]:
     if score is None:
         return ["no trial was counted" + (f": {suite.unplayable}" if suite.unplayable else "")]
     counted = f"{score.trials} of {suite.trials} trials counted"
+    if not score.lenient.successes:
+        return [f"policy {score.version}, {counted}: no success"]
     return [
         f"policy {score.version}, {counted}; successes, rate and its 95 % interval:",
         *(

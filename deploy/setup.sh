@@ -93,9 +93,30 @@ install_extra() {
     pip_install --no-deps "${packages[@]}"
 }
 
+# On a terminal pip shows its own progress bars; elsewhere there is a line now and then.
 pip_install() {
-    PYTHONWARNINGS=ignore "$VENV/bin/python" -m pip install --quiet --no-input --disable-pip-version-check \
-        --root-user-action=ignore "$@" || fail "pip could not install; see above; is there a network?"
+    if [[ -t 1 ]]; then run_pip "$@"; else run_pip "$@" | tell_progress; fi ||
+        fail "pip could not install; see above; is there a network?"
+}
+
+run_pip() {
+    PYTHONWARNINGS=ignore "$VENV/bin/python" -m pip install --no-input --disable-pip-version-check \
+        --root-user-action=ignore "$@"
+}
+
+# Reads pip's output and tells how many packages it has found, large downloads, and when it unpacks.
+tell_progress() {
+    local line packages=0
+    while read -r line; do
+        case "$line" in
+            "Collecting "* | "Requirement already satisfied: "*)
+                packages=$((packages + 1))
+                if ((packages % 10 == 0)); then say "$packages packages so far"; fi
+                ;;
+            "Downloading "*[0-9][0-9]" MB)" | "Downloading "*[0-9][0-9].[0-9]" MB)" | "Downloading "*" GB)") say "${line,}" ;;
+            "Installing collected packages: "*) say "unpacking" ;;
+        esac
+    done
 }
 
 # Some packages need shared libraries that a minimal system does not have: OpenMP and X11.

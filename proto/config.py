@@ -129,7 +129,13 @@ _RETIRED_KEYS: Final = (
 
 
 class RunConfig(_Section):
-    """Name and folder of the run, and the seed of all random numbers in its training."""
+    """Name and folder of the run, and the seed of all random numbers in its training.
+
+    Attributes:
+        name: name of the run, of its folder and in the keys of its messages.
+        folder: folder that holds the folders of runs.
+        seed: seed of the weights and of all other random numbers in training.
+    """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", max_length=100)] = (
         "experiment1"
@@ -148,8 +154,8 @@ class HubConfig(_Section):
     that a saved configuration can be read on any machine.
 
     Attributes:
-        endpoint: where the hub listens and all others connect.
-        shared_memory: large messages between processes of one machine go through shared memory.
+        endpoint: where the hub listens and all others connect, as protocol/HOST:PORT.
+        shared_memory: pass large messages between processes of one machine in shared memory.
         security: `mutual-tls`: both ends of every link show a certificate, and the hub lets each
             role do only what `proto.permissions` allows; needs an endpoint `tls/HOST:PORT`.
             `none`: only processes of this machine can connect.
@@ -257,7 +263,12 @@ class TutorConfig(_Section):
 
 
 class SubnetConfig(_Section):
-    """A fully connected subnet of leaky integrators (PFC, M_S, M_F)."""
+    """A fully connected subnet of leaky integrators (PFC, M_S, M_F).
+
+    Attributes:
+        units: number of units.
+        tau: time constant (control steps).
+    """
 
     units: Units
     tau: TimeConstant
@@ -280,7 +291,22 @@ class MapsConfig(_Section):
 
 
 class NetworkConfig(_Section):
-    """VMDNN (paper, section 4.1)."""
+    """VMDNN (paper, section 4.1).
+
+    Attributes:
+        mstnn_fast: V_F, the first convolutional subnet.
+        mstnn_slow: V_S, the second convolutional subnet.
+        pfc: PFC, which connects vision and action.
+        mtrnn_slow: M_S, the slow subnet of the action.
+        mtrnn_fast: M_F, the fast subnet of the action.
+        softmax_units: output units of each action value.
+        code_margin: how far the output units reach beyond the range of a value, as a fraction of
+            the range.
+        code_width: width of the response of an output unit, in distances between two of them.
+        update_order: `bottom_up`: a subnet gets the activity of this step from those that were
+            computed before it; `literal`: all input is that of the step before, as eq. (1) is
+            printed.
+    """
 
     mstnn_fast: MapsConfig = MapsConfig(maps=3, kernel=(22, 14), stride=2, tau=2)
     mstnn_slow: MapsConfig = MapsConfig(maps=6, kernel=(8, 6), stride=2, tau=30)
@@ -315,6 +341,20 @@ class PretrainingConfig(_Section):
     starts with `start_sequences` of them, or with all if there are fewer. If `task` is None, and in
     `vmdnn train` without --pretraining-data, pre-training uses the sequences of coupled training.
     The task defines the questions that the network learns to answer.
+
+    Attributes:
+        task: task whose sequences pre-training learns from; None for those of coupled training.
+        cases: indices of its tutored cases; None for all.
+        repeats: executions of each case; the first has no noise.
+        start_sequences: number of sequences with which pre-training starts.
+        epochs: epochs of pre-training; 0 for none.
+        rate: learning rate of Adam.
+        batch: sequences in a minibatch.
+        image_shift: largest shift of the pictures, drawn anew for each sequence and epoch (pixels).
+        image_gain: standard deviation of changes of contrast and brightness; pixels are -1..1.
+        image_noise: standard deviation of noise added to the pixels, which are -1..1.
+        threads: threads of pre-training, while actors wait for the first policy; None for
+            `learner.threads`.
     """
 
     task: TaskName | None = None
@@ -324,13 +364,9 @@ class PretrainingConfig(_Section):
     epochs: Natural = 30
     rate: Positive = 2e-3
     batch: Count = 15
-    # Augmentation of the pictures, drawn anew for each sequence and epoch: largest shift (pixels),
-    # standard deviation of contrast and brightness, standard deviation of pixel noise. Pixel values
-    # are -1..1.
     image_shift: Natural = 3
     image_gain: NotNegative = 0.05
     image_noise: NotNegative = 0.03
-    # Threads of pre-training, while actors wait for the first policy; by default `learner.threads`.
     threads: Count | None = None
 
 
@@ -350,7 +386,7 @@ class CorrectionsConfig(_Section):
         tries: episodes of practice that are judged in a round to find failures.
         epochs: epochs of training in a round.
         suites: names of the suites that are practised, and whose failures are chosen: `unlearned`
-            or suites of `EvaluatorConfig.suites`. Each has seeds for practice besides those of its
+            or suites of `evaluator.suites`. Each has seeds for practice besides those of its
             trials.
     """
 
@@ -370,6 +406,26 @@ class LearnerConfig(_Section):
     arrive within `lease_s`, the case is assigned again. Training starts with `start_sequences`, or
     with all sequences if there are fewer. It publishes a policy every `publish_every_epochs` and
     after the last of its `epochs`. The rounds of `corrections` follow.
+
+    Attributes:
+        cases: indices of the task's tutored cases; None for all.
+        lease_s: a case whose sequence does not arrive after this time is assigned again (s).
+        start_sequences: number of sequences with which coupled training starts.
+        epochs: epochs of coupled training before any corrections.
+        rate: learning rate of Adam.
+        schedule: how the learning rate changes after the warm-up.
+        warmup_epochs: epochs in which the learning rate rises from 0.
+        batch: sequences in a minibatch.
+        clip_norm: largest norm of the gradient; None for no limit.
+        vision_noise: noise added to each unit of V_S, drawn anew for each sequence and epoch, in
+            standard deviations of the unit's activity.
+        interpolation: fraction of the sequences that is replaced by sequences interpolated between
+            neighbouring tutored situations.
+        initial_range: the first weights are drawn from -initial_range..initial_range.
+        initial_range_pfc_input: the same for the weights from V_S to the PFC.
+        checkpoint_every_epochs: how often a checkpoint is written.
+        publish_every_epochs: how often a policy version is published.
+        threads: threads of coupled training.
     """
 
     cases: tuple[Natural, ...] | None = None
@@ -381,11 +437,7 @@ class LearnerConfig(_Section):
     warmup_epochs: Natural = 12
     batch: Count = 30
     clip_norm: Positive | None = 1.0
-    # Noise added to each unit of V_S in coupled training, drawn anew for each sequence and epoch,
-    # in standard deviations of the unit's activity.
     vision_noise: NotNegative = 0.3
-    # Fraction of the sequences that coupled training replaces by sequences interpolated between
-    # neighbouring tutored situations.
     interpolation: Annotated[float, Field(strict=True, ge=0, le=1)] = 0.7
     initial_range: Positive = 0.1
     initial_range_pfc_input: Positive = 0.2
@@ -535,6 +587,9 @@ class EvaluatorConfig(_Section):
         trials_per_policy: number of trials of each policy version.
         seed: seed of the first trial; trial i has the seed `seed + i`.
         lease_s: a trial that is not finished after this time is assigned again (s).
+        first_trials: number of trials of each policy version in each suite that actors finish
+            before they take a newer version. With 0 they take the newest version at once, so that
+            versions that follow each other quickly get few trials or none.
         suites: the suites, the most important first; None for `unlearned` alone.
     """
 
@@ -542,6 +597,7 @@ class EvaluatorConfig(_Section):
     # The bound keeps the seeds of all trials below those of corrections and practice.
     seed: Annotated[int, Field(strict=True, ge=0, le=TRIALS_BELOW - 2**28)] = 1000
     lease_s: Positive = 60.0
+    first_trials: Natural = 0
     suites: Annotated[tuple[SuiteConfig, ...], AfterValidator(_check_suites)] | None = None
 
 
@@ -843,8 +899,8 @@ def _key_of(problem: ErrorDetails) -> str:
 
 def _what_is_wrong(problem: ErrorDetails) -> str:
     if problem["type"] == "extra_forbidden":
-        similar = get_close_matches(_key_of(problem), _keys_of(Config), n=1)
-        advice = f"did you mean {similar[0]}?" if similar else "proto/config.py lists all keys"
+        similar = _similar_key(_key_of(problem))
+        advice = f"did you mean {similar}?" if similar else "`vmdnn config` lists all keys"
         return f"there is no such key; {advice}"
     what = plain(problem["msg"].removeprefix("Value error, "), 300)
     return f"{what} (got {_shown(problem['input'])})"
@@ -862,6 +918,17 @@ def _count_values(value: Any) -> int:
     if isinstance(value, list):
         return 1 + sum(map(_count_values, value))
     return 1
+
+
+def _similar_key(key: str) -> str:
+    """The key that is meant most likely, such as learner.epochs for `epochs`; empty if none is."""
+    keys = _keys_of(Config)
+    if whole := get_close_matches(key, keys, n=1, cutoff=0.8):
+        return whole[0]
+    last_parts = {each.rpartition(".")[2]: each for each in reversed(keys)}
+    if last := get_close_matches(key.rpartition(".")[2], last_parts, n=1, cutoff=0.8):
+        return last_parts[last[0]]
+    return next(iter(get_close_matches(key, keys, n=1)), "")
 
 
 def _keys_of(section: type[BaseModel], prefix: str = "") -> list[str]:

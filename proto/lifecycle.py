@@ -36,6 +36,7 @@ class Lifecycle:
         self._waiting_for = ""
         self._waiting_since_s = 0.0
         self._log_at_s = 0.0
+        self._log_again_s = LOG_WAIT_AGAIN_S
         self._logged = False
         self._worked_at_s = clock()
 
@@ -80,17 +81,23 @@ class Lifecycle:
         """Note that the main loop goes on. A process that stops doing so is killed in the end."""
         self._worked_at_s = self._clock()
 
-    def waits_for(self, what: str) -> None:
+    def waits_for(self, what: str, *, log_again_s: float = LOG_WAIT_AGAIN_S) -> None:
         """Say what this process waits for now, or with an empty text that it works.
 
-        A wait that lasts is logged once, when it has lasted for LOG_WAIT_AFTER_S, and then rarely.
-        The text may change during a wait, such as a number in it.
+        A wait that lasts is logged when it has lasted for LOG_WAIT_AFTER_S, and then again and
+        again. The text may change during a wait, such as a number in it.
+
+        Args:
+            what: what it waits for.
+            log_again_s: time between two lines about the wait (s); rarely, unless somebody has to
+                do something.
         """
         self.goes_on()
         what = "".join(mark if mark.isprintable() else " " for mark in what)
         with self._lock:
             now_s = self._clock()
             before, self._waiting_for = self._waiting_for, what
+            self._log_again_s = log_again_s
             if what and not before:
                 self._waiting_since_s = now_s
                 self._log_at_s = now_s + LOG_WAIT_AFTER_S
@@ -108,7 +115,7 @@ class Lifecycle:
             now_s = self._clock()
             if not self._waiting_for or now_s < self._log_at_s:
                 return
-            self._log_at_s = now_s + LOG_WAIT_AGAIN_S
+            self._log_at_s = now_s + self._log_again_s
             self._logged = True
             what, waited_s = self._waiting_for, now_s - self._waiting_since_s
         LOG.info("waiting for %s (since %.0f s)", what, waited_s)

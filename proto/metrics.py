@@ -135,12 +135,15 @@ class LearnerMetrics(Metrics):
         stage: waiting for sequences or corrections, pretraining, coupled training, or finished.
         epoch: epochs done in this stage.
         epochs_total: number of epochs of this stage.
+        epochs_later: number of epochs of the stages after this one.
         loss: loss of the last epoch; null before the first.
         learning_rate: learning rate of the last epoch; null before the first since the process
             started.
         training: id of the training.
         sequences: stored sequences, including those of pre-training.
+        sequences_total: number of stored sequences when all tutored cases have come.
         round: number of the current round of corrections; 0 before the first.
+        rounds: number of rounds of corrections that the configuration asks for.
         corrections: stored corrections of this round; 0 unless the stage is `waiting`.
         corrections_total: largest number of corrections of this round; 0 unless the stage is
             `waiting`.
@@ -151,6 +154,7 @@ class LearnerMetrics(Metrics):
         epochs_per_s: epochs per second since the last metrics.
         epochs: the newest epochs since the last metrics, at most MOST_EPOCHS.
         policy_version: newest published version; 0 if there is none.
+        policies_total: number of policy versions that the configuration gives.
         paused: whether it is paused.
         done: whether the learner's part of the configuration's `done` is reached.
     """
@@ -159,11 +163,14 @@ class LearnerMetrics(Metrics):
     stage: Stage
     epoch: Count
     epochs_total: Count
+    epochs_later: Count
     loss: Annotated[float | None, Maybe(Number(0.0, 1e9))]
     learning_rate: Annotated[float | None, Maybe(Number(0.0, LARGEST_LEARNING_RATE))]
     training: Training
     sequences: Count
+    sequences_total: Count
     round: Count
+    rounds: Count
     corrections: Count
     corrections_total: Count
     damaged: Count
@@ -171,6 +178,7 @@ class LearnerMetrics(Metrics):
     epochs_per_s: Rate
     epochs: Epochs = ()
     policy_version: Count
+    policies_total: Count
     paused: bool
     done: bool
 

@@ -18,6 +18,10 @@ from proto.storage import make_folder, storage_errors
 LOG = logging.getLogger(__name__)
 
 
+class AlreadyWorksError(UserError):
+    """Another process of a role works in the folder of a run."""
+
+
 @contextmanager
 def owned_run(run_folder: Path) -> Iterator[None]:
     """Hold the lock of whoever starts the processes of a run, until the context ends.
@@ -39,11 +43,11 @@ def only_one(run_folder: Path, role: Role, name: str) -> Iterator[None]:
     """Hold the lock of a role and a name in a run's folder until the context ends.
 
     Raises:
-        UserError: another process holds it.
+        AlreadyWorksError: another process holds it.
     """
     with _lock(run_folder, f"{role}-{name}") as held:
         if not held:
-            raise UserError(
+            raise AlreadyWorksError(
                 f"{role.with_article} with the id {name!r} already works in {run_folder}: stop it, "
                 "or choose another --id or run"
             )

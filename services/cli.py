@@ -6,7 +6,7 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from importlib.metadata import version
 from typing import Final, Protocol, cast
 
@@ -49,8 +49,13 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "import": ("services.commands.import_sequences", "learn from what others have recorded"),
     "recover": ("services.commands.recover", "save what is whole of a damaged MCAP file"),
     "check": ("services.commands.check", "look for damage in the folder of a run"),
+    "runs": ("services.commands.runs", "list runs with their best policy"),
+    "rollouts": ("services.commands.rollouts", "list the recorded rollouts of a run"),
+    "compare-runs": ("services.commands.compare_runs", "compare two runs side by side"),
+    "config": ("services.commands.config", "show all keys of the configuration"),
     "inspect": ("services.commands.inspect", "show a network, a checkpoint, a task or its vision"),
     "bench": ("services.commands.bench", "measure speed on this machine"),
+    "completion": ("services.commands.completion", "print a script that completes commands"),
     "doctor": ("services.commands.doctor", "check this machine and say what to do"),
 }
 
@@ -65,27 +70,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status: 2 after a message about bad input.
     """
     _use_one_thread()
-    parser = argparse.ArgumentParser(
-        prog="vmdnn",
-        description="Tutor simulated iCub humanoids with VMDNN, from one laptop to a cluster.",
-        epilog="`vmdnn COMMAND --help` explains a command.",
-    )
-    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    parser.add_argument("--version", action="version", version=f"%(prog)s {version('vmdnn')}")
     words = list(sys.argv[1:] if argv is None else argv)
     chosen = next((word for word in words if not word.startswith("-")), None)
-    for name, (module, summary) in COMMANDS.items():
-        subparser = subparsers.add_parser(
-            name,
-            help=summary,
-            description=summary[0].upper() + summary[1:] + ".",
-            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-        )
-        if name == chosen:
-            command = cast("Subcommand", importlib.import_module(module))
-            command.configure(subparser)
-            subparser.set_defaults(run=command.run)
-    arguments = parser.parse_args(words)
+    arguments = _parser([] if chosen is None else [chosen]).parse_args(words)
     try:
         return int(arguments.run(arguments))
     except UserError as error:
@@ -96,6 +83,34 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of the output, such as `head`, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
+
+
+def whole_parser() -> argparse.ArgumentParser:
+    """Return a parser that knows the arguments of all subcommands; it imports all modules."""
+    return _parser(COMMANDS)
+
+
+def _parser(configured: Collection[str]) -> argparse.ArgumentParser:
+    """Return a parser that knows all subcommands, and the arguments of those in `configured`."""
+    parser = argparse.ArgumentParser(
+        prog="vmdnn",
+        description="Tutor simulated iCub humanoids with VMDNN, from one laptop to a cluster.",
+        epilog="`vmdnn COMMAND --help` explains a command.",
+    )
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    parser.add_argument("--version", action="version", version=f"%(prog)s {version('vmdnn')}")
+    for name, (module, summary) in COMMANDS.items():
+        subparser = subparsers.add_parser(
+            name,
+            help=summary,
+            description=summary[0].upper() + summary[1:] + ".",
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+        if name in configured:
+            command = cast("Subcommand", importlib.import_module(module))
+            command.configure(subparser)
+            subparser.set_defaults(run=command.run)
+    return parser
 
 
 def _use_one_thread() -> None:

@@ -41,6 +41,7 @@ from proto.situations import situation_of
 from proto.storage import make_folder
 from proto.suites import Player, Suite
 from services.trials.asked import AskedTrials, NotYetError
+from services.trials.run_folder import trial_log_file
 from services.trials.success import Tally
 from services.trials.trial_log import TrialLog
 
@@ -86,7 +87,7 @@ class Evaluator:
         self._config = config
         self._bus = bus
         self._lifecycle = lifecycle
-        self._log = TrialLog(config.run_folder / "evaluation" / "trials.jsonl")
+        self._log = TrialLog(trial_log_file(config.run_folder))
         self._leases: Leases[TrialKey] = Leases(config.evaluator.lease_s)
         self._suites = {suite.name: suite for suite in config.suites}
         self._practised = {suite.name: suite for suite in config.practised_suites()}
@@ -206,13 +207,15 @@ class Evaluator:
             self._bus.refuse(f"actor/{request.actor}", OTHER_SETTINGS)
             return None
         self._players.note(request.actor, request.player)
-        if self._lifecycle.paused or (request.run_id, request.policy_version) != newest:
+        policy = (request.run_id, request.policy_version)
+        if self._lifecycle.paused or policy[0] != newest[0] or not 1 <= policy[1] <= newest[1]:
             return None
-        taken = self._leases.take(request.actor, self._wanted(newest, request.player))
+        taken = self._leases.take(request.actor, self._wanted(policy, request.player))
         if taken is None:
             return None
         _, name, seed = taken
-        self._asked.give(newest, (name, seed), request.actor)
+        self._asked.give(policy, (name, seed), request.actor)
+        LOG.debug("policy %d: trial %d of %s goes to %s", policy[1], seed, name, request.actor)
         return Trial(seed, self._suites[name].conditions(seed))
 
     def _wanted(self, policy: PolicyKey, player: Player) -> Iterator[TrialKey]:
@@ -223,8 +226,11 @@ class Evaluator:
                     yield policy, suite.name, seed
 
     def _missing(self, policy: PolicyKey, suite: Suite) -> list[int]:
+        """The trials that a policy still gets: all of the newest, the first ones of another."""
+        first = self._config.evaluator.first_trials
+        seeds = suite.test_seeds if policy == self._asked.newest else suite.test_seeds[:first]
         counted = self._counted(policy, suite)
-        return [seed for seed in suite.test_seeds if seed not in counted]
+        return [seed for seed in seeds if seed not in counted]
 
     def _look_for_players(self) -> None:
         """Note, and log once, which suites have trials that no present actor can play."""

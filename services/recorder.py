@@ -23,6 +23,7 @@ from proto.lifecycle import Lifecycle
 from proto.membership import membership
 from proto.messages import Receipt, Rollout
 from proto.metrics import RecorderMetrics
+from proto.plain_text import plain
 from proto.recordings.episodes import write_episode
 from proto.recordings.schemas import SceneUpdate
 from services.monitoring.run_monitor import RunMonitor
@@ -36,7 +37,7 @@ WAITING: Final = 64
 
 
 class Recorder:
-    """Writes each rollout once, as `<id>.mcap`, into the run's `rollouts` folder."""
+    """Writes each rollout once into the run's `rollouts` folder."""
 
     def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
         """Find what was recorded before, and start to collect rollouts."""
@@ -103,6 +104,11 @@ class Recorder:
             self._bytes += path.stat().st_size
             self._recordings.add(path, episode.kind)
             self._monitor.note(episode)
+            LOG.info(
+                "recorded %s of policy %d, seed %d: %s, %s",
+                *(episode.kind, episode.policy_version, episode.seed),
+                *(plain(episode.outcome.reason), path.name),
+            )
         receipt = self._bus.keys.receipt(Role.RECORDER, episode.actor)
         self._bus.deliver(receipt, Receipt(episode.id))
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections import OrderedDict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from proto.config import KeepConfig
 from proto.episode import Episode, Kind
 from proto.errors import UserError
-from proto.recordings.episodes import read_kind
+from proto.recordings.episodes import read_head
 from proto.storage import delete_file, parts_in
 
 LOG = logging.getLogger(__name__)
@@ -39,14 +40,19 @@ class Recordings:
         files = {path: path.stat() for path in folder.glob("*.mcap")}
         for path in sorted(files, key=lambda path: files[path].st_mtime_ns):
             try:
-                self.add(path, read_kind(path))
+                self.add(path, read_head(path).kind)
             except UserError as error:
                 self._bytes += files[path].st_size
                 LOG.warning("is kept, and counted in no limit: %s", error)
 
     def path(self, episode: Episode) -> Path:
-        """Where an episode is recorded."""
-        return self.folder / f"{episode.id}.mcap"
+        """Where an episode is recorded; the names sort by the time at which it was played."""
+        former = self.folder / f"{episode.id}.mcap"  # as vmdnn 0.1 named it
+        if episode.started_s is None or former.exists():
+            return former
+        played = datetime.fromtimestamp(episode.started_s, UTC)
+        stamp = f"{played:%Y%m%d-%H%M%S}-{played.microsecond // 1000:03d}"
+        return self.folder / f"{stamp}_{episode.id}.mcap"
 
     def add(self, path: Path, kind: Kind) -> None:
         """Note that a file was written, and delete the oldest practice if there is too much."""

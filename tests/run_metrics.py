@@ -9,6 +9,7 @@ from proto.metrics import (
     LearnerMetrics,
     Metrics,
     PolicyScore,
+    RecorderMetrics,
     Stage,
     Success,
     SuiteScore,
@@ -23,10 +24,10 @@ ACTOR = ActorMetrics(
     put_aside=0, failed=0, paused=False,
 )  # fmt: skip
 LEARNER = LearnerMetrics(
-    id="l", time_s=1.0, refused=0, stage=Stage.COUPLED, epoch=120, epochs_total=2500, loss=0.4321,
-    learning_rate=0.002, training="t-1",
-    sequences=45, round=0, corrections=0, corrections_total=0, damaged=0, given_up=0,
-    epochs_per_s=12.5, policy_version=3, paused=False, done=False,
+    id="l", time_s=1.0, refused=0, stage=Stage.COUPLED, epoch=120, epochs_total=2500,
+    epochs_later=0, loss=0.4321, learning_rate=0.002, training="t-1", sequences=45,
+    sequences_total=45, round=0, rounds=0, corrections=0, corrections_total=0, damaged=0,
+    given_up=0, epochs_per_s=12.5, policy_version=3, policies_total=13, paused=False, done=False,
 )  # fmt: skip
 
 
@@ -45,6 +46,11 @@ EVALUATOR = EvaluatorMetrics(
     id="e", time_s=1.0, refused=0, policies=SCORES, damaged=0,
     suites=(SuiteScore("unlearned", "sapien", 52, "", SCORES),), leases=1, paused=False, done=False,
 )  # fmt: skip
+
+
+RECORDER = RecorderMetrics(
+    id="r", time_s=1.0, refused=0, episodes=12, bytes=3_400_000, dropped=0, deleted=0
+)
 
 
 def view_of(*metrics: Metrics) -> RunView:

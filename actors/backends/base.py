@@ -13,6 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from actors.backends import eye
+from actors.backends.furniture import furnished
 from actors.backends.robot import (
     MOTOR_COUNT,
     build_robot,
@@ -76,7 +77,10 @@ class Renderer(Protocol):
         """Replace what was drawn beside the robot."""
 
     def place(self, poses: Any, step: int) -> None:
-        """Move the copies to `World.poses`, and show the screen's frame of a control step."""
+        """Move the copies to `World.poses`, and show the screen's frame of a control step.
+
+        Boxes that are not in the world stay where the scene puts them.
+        """
 
     def picture(self, place: Any, /, width: int, height: int, focal: tuple[float, float]) -> Image:
         """Picture (height, width, 4) from a place with the focal lengths (pixels)."""
@@ -149,7 +153,7 @@ class BaseSimulator(ABC, Generic[W, R]):
         if self._eye_renderer is not None:
             self._eye_renderer = self._renewed(self._eye_renderer, scene)
         if self._outside_renderer is not None:
-            self._outside_renderer = self._renewed(self._outside_renderer, scene)
+            self._outside_renderer = self._renewed(self._outside_renderer, furnished(scene))
 
     def step(self, targets: JointTargets) -> StepReport:
         """Run one control period, moving the motors' targets linearly to `targets`.
@@ -219,7 +223,7 @@ class BaseSimulator(ABC, Generic[W, R]):
         """Colour picture (height, width, 3) uint8 of the scene from outside, full meshes."""
         if self._outside_renderer is None:
             robot = self._model.seen_from_outside
-            self._outside_renderer = self._make_renderer(robot, self._scene)
+            self._outside_renderer = self._make_renderer(robot, furnished(self._scene))
         self._outside_renderer.place(self._world.poses(), self._step)
         factor = eye.OUTSIDE_SUPERSAMPLING
         focal = eye.outside_focal_lengths(factor * height)

@@ -23,9 +23,10 @@ def make_policy(name: str, task: Task) -> Policy:
     """Make the policy called `name`, to play a task.
 
     Args:
-        name: `tutor`, a baseline of the task, the path of a checkpoint, `pretrained:NAME`, or a
-            user's class as `package.module:Class`, which is called without arguments. Before it may
-            stand the name of one of `task.blinded`, as in `blank-screen:pretrained:NAME`.
+        name: `tutor`, a baseline of the task, the path of a checkpoint, the folder of a run (its
+            newest policy), `pretrained:NAME`, or a user's class as `package.module:Class`, which is
+            called without arguments. Before it may stand the name of one of `task.blinded`, as in
+            `blank-screen:pretrained:NAME`.
         task: the task that is played.
 
     Raises:
@@ -47,7 +48,8 @@ def make_policy(name: str, task: Task) -> Policy:
     names = ", ".join(["tutor", *task.baselines, *blinded, *pretrained_names()])
     raise UserError(
         f"policy {name!r}: no such policy or checkpoint file. There are: {names}, the path of a"
-        " .safetensors checkpoint, or a policy of your own as package.module:Class."
+        " .safetensors checkpoint, the folder of a run, or a policy of your own as"
+        " package.module:Class."
     )
 
 

@@ -163,6 +163,11 @@ class Trainer:
         return self._rounds.total
 
     @property
+    def epochs_later(self) -> int:
+        """Epochs of the stages after this one."""
+        return self._rounds.total if self.stage is Stage.PRETRAINING else 0
+
+    @property
     def round(self) -> int:
         """Round that the next epoch belongs to; 0 before any corrections and in pre-training."""
         return 0 if self.stage is Stage.PRETRAINING else self._rounds.round_at(self.epochs_done)

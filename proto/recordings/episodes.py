@@ -258,18 +258,53 @@ def read_summary(path: Path) -> EpisodeSummary:
         raise _not_an_episode(path, error) from error
 
 
-def read_kind(path: Path) -> Kind:
-    """Read why an episode was played; only the beginning of the file is read.
+@dataclass(frozen=True)
+class RecordingHead:
+    """What the beginning of a recording tells of its episode; see `Episode`.
+
+    Attributes:
+        reason: the reason of its outcome; `NO_FAILURE` for a precise one.
+    """
+
+    id: str
+    kind: Kind
+    task: str
+    actor: str
+    policy: str
+    policy_version: int
+    seed: int
+    situation: Situation
+    reason: str
+    started_s: float | None
+
+
+def read_head(path: Path) -> RecordingHead:
+    """Read what an episode is; only the beginning of the file is read.
 
     Raises:
         UserError: it cannot be read.
     """
+    texts: dict[str, dict[str, str]] = {}
     try:
         with path.open("rb") as stream:
             beginning = stream.read(_BEGINNING_BYTES)
         for record in whole_records(beginning):
-            if isinstance(record, Metadata) and record.name == "episode":
-                return Kind(record.metadata["kind"])
+            if isinstance(record, Metadata):
+                texts[record.name] = record.metadata
+                if record.name == "outcome":  # it comes after the episode and its situation
+                    episode = texts["episode"]
+                    return RecordingHead(
+                        id=episode["id"],
+                        kind=Kind(episode["kind"]),
+                        task=episode["task"],
+                        actor=episode["actor"],
+                        policy=episode["policy"],
+                        policy_version=int(episode["policy_version"]),
+                        seed=int(episode["seed"]),
+                        situation={k: json.loads(v) for k, v in texts["situation"].items()},
+                        reason=record.metadata["reason"],
+                        started_s=_started_s(episode),
+                    )
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except (DamageError, *_BROKEN) as error:

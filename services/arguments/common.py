@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -11,12 +10,16 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from proto.config import Config, load_config
-from proto.errors import UserError
-from proto.plain_text import plain_lines
+from pydantic import ValidationError
 
+from proto.config import Config, HubConfig, load_config
+from proto.errors import UserError
+
+INTERRUPTED: Final = 130
+"""Exit status of a command that Ctrl-C stopped."""
 LARGEST_SEED: Final = 2**32 - 1
 LARGEST_PORT: Final = 65_535
+_BUILT_IN: Final = Path(str(files("deploy")), "config")
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
@@ -43,16 +46,38 @@ def add_connection(parser: argparse.ArgumentParser) -> None:
     add_config(parser)
     parser.add_argument(
         "--connect",
+        type=endpoint,
         metavar="tcp/HOST:PORT|tls/HOST:PORT",
         help="endpoint of the hub; without it, hub.endpoint of the configuration. tls/ also sets"
         " hub.security=mutual-tls",
     )
 
 
+def endpoint(text: str) -> str:
+    """`type=` of an argument that is the endpoint of a hub."""
+    try:
+        return HubConfig(endpoint=text).endpoint
+    except ValidationError:
+        host = text.rpartition("/")[2].partition(":")[0] or "HOST"
+        port = text.rpartition(":")[2] if re.search(r":\d+$", text) else "7447"
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not an endpoint: write tcp/HOST:PORT, such as tcp/{host}:{port}"
+        ) from None
+
+
 def add_process(parser: argparse.ArgumentParser) -> None:
-    """Add --config, --set, --connect and --id, for a process on the bus."""
+    """Add --config, --set, --connect, --id and options of the log, for a process on the bus."""
     add_connection(parser)
     parser.add_argument("--id", type=_id, help="name of this process on the bus")
+    amount = parser.add_mutually_exclusive_group()
+    amount.add_argument("-v", "--verbose", action="store_true", help="log details, too")
+    amount.add_argument("-q", "--quiet", action="store_true", help="log warnings and errors only")
+    parser.add_argument(
+        "--log-format",
+        choices=("text", "json"),
+        default="text",
+        help="json: one object for each record, with run, role and id",
+    )
 
 
 def listening_address(text: str) -> tuple[str, int]:
@@ -87,12 +112,16 @@ def config_file(name: str) -> Path:
     path = Path(name)
     if path.is_file() or path.suffix or path.name != name:  # a run may have a folder of that name
         return path
-    built_in = {file.stem: file for file in Path(str(files("deploy")), "config").glob("*.yaml")}
-    if name not in built_in:
+    if name not in built_in_names():
         raise UserError(
-            f"config file {name} does not exist; built in are: {', '.join(sorted(built_in))}"
+            f"config file {name} does not exist; built in are: {', '.join(built_in_names())}"
         )
-    return built_in[name]
+    return _BUILT_IN / f"{name}.yaml"
+
+
+def built_in_names() -> list[str]:
+    """Names of the built-in configurations."""
+    return sorted(file.stem for file in _BUILT_IN.glob("*.yaml"))
 
 
 def config_argument(name: str) -> Path:
@@ -124,23 +153,6 @@ def overrides_of(arguments: argparse.Namespace) -> list[str]:
             raise UserError("--run takes the run's configuration from its learner: no --config")
         overrides.append(f"run.name={arguments.run_name}")
     return overrides
-
-
-def start_logging(role: str) -> None:
-    """Log to standard error; each line has the time and the role."""
-    handler = logging.StreamHandler()
-    handler.setFormatter(_PlainFormatter(f"%(asctime)s {role} %(levelname)s %(message)s"))
-    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
-
-
-class _PlainFormatter(logging.Formatter):
-    """Writes each record so that no text in it can look like another record.
-
-    The further lines of a message and of a stack trace are indented.
-    """
-
-    def format(self, record: logging.LogRecord) -> str:
-        return "\n    ".join(plain_lines(super().format(record)).split("\n"))
 
 
 def _id(text: str) -> str:

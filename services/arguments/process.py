@@ -21,7 +21,8 @@ from proto.periodic import every
 from proto.run_locks import own_id, single_process
 from proto.security import actor_name
 from proto.storage import DiskFullError, StorageError
-from services.arguments.common import config_of, overrides_of, start_logging
+from services.arguments.common import config_of, overrides_of
+from services.arguments.logs import ProcessLog
 
 LOG = logging.getLogger(__name__)
 
@@ -66,8 +67,9 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
         UserError: the configuration is not valid, or the run already has such a process.
     """
     os.umask(PRIVATE)
-    start_logging(role)
+    log = ProcessLog(role, arguments)
     config = config_of(arguments)
+    log.run = config.run.name
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
     told = ""
@@ -79,6 +81,7 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
                     _identity(config, role, arguments.id, taken) as name,
                     _join(config, role, name, lifecycle) as bus,
                 ):
+                    log.id = name
                     if bus is None:
                         return 0
                     if role is Role.ACTOR and not Claim(bus).holds(lifecycle):

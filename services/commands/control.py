@@ -9,13 +9,13 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from proto.bus import open_bus
 from proto.codec import encode
 from proto.keys import Role
 from proto.messages import Command, Control, ControlReply
 from proto.permissions import Holder
 from proto.plain_text import plain
 from services.arguments.common import add_connection, config_of
+from services.arguments.watching import add_wait, open_bus_within
 
 ROLES: Final = tuple(role for role in Role if role is not Role.WATCH)
 """Roles whose processes reply to control messages."""
@@ -30,6 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("do", choices=[command.value for command in Command], help="the command")
     add_connection(parser)
+    add_wait(parser)
     parser.add_argument("--json", action="store_true", help="print the replies as JSON")
 
 
@@ -37,8 +38,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Send the command and print the replies; without replies the exit status is 1."""
     config = config_of(arguments)
     role, control = Role(arguments.role), Control(Command(arguments.do))
-    hub, name = config.hub, f"control-{os.getpid()}"
-    with open_bus(hub, config.run.name, Role.WATCH, name, holder=Holder.OPERATOR) as bus:
+    name = f"control-{os.getpid()}"
+    with open_bus_within(config, name, arguments.wait, holder=Holder.OPERATOR) as bus:
         replies = bus.ask(bus.keys.control(role), control, ControlReply, timeout_s=REPLY_WITHIN_S)
     if not replies:
         print(

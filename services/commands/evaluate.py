@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Iterable
 from contextlib import closing
@@ -11,13 +12,23 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from actors.policies.by_name import make_policy
 from actors.tasks.registry import make_task
 from proto.config import Config
+from proto.episode import Episode
 from proto.errors import UserError
 from proto.storage import written_whole
 from proto.suites import Suite
 from proto.variables import parse_situation
-from services.arguments.common import add_config, add_playing, playing_config, positive, seed
+from services.arguments.common import (
+    INTERRUPTED,
+    add_config,
+    add_playing,
+    playing_config,
+    positive,
+    seed,
+)
+from services.commands.evaluate_run import evaluate_run
 from services.playing.video import write_video
 from services.playing.video_file import video_argument
 from services.playing.workers import Job, play_all
@@ -36,12 +47,26 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the subcommand's arguments."""
     add_config(parser)
     add_playing(parser)
-    parser.add_argument(
+    tested = parser.add_mutually_exclusive_group(required=True)
+    tested.add_argument(
         "--policy",
-        required=True,
         help="tutor, a baseline of the task (`vmdnn inspect task` lists them), pretrained:NAME, a"
-        " checkpoint's file, or a class of your own as package.module:Class; a task may name"
-        " blinded policies, such as blank-screen:POLICY",
+        " checkpoint's file, the folder of a run (its newest policy), or a class of your own as"
+        " package.module:Class; a task may name blinded policies, such as blank-screen:POLICY",
+    )
+    tested.add_argument(
+        "--run",
+        dest="run_folder",
+        type=Path,
+        metavar="DIR",
+        help="folder of a run: play what is missing of the trials of its policy versions, and add"
+        " them to those that the run has counted",
+    )
+    parser.add_argument(
+        "--policy-version",
+        default="newest",
+        metavar="all|best|newest|N",
+        help="with --run: which versions",
     )
     parser.add_argument(
         "--suite",
@@ -77,29 +102,42 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="record the activity of the network's subnets in the rollouts; a megabyte each",
     )
     parser.add_argument(
-        "--video", type=video_argument, help="file for a video of the first trial, .mp4 or .gif"
+        "--video",
+        type=video_argument,
+        help="file for a video of all trials, one after the other, .mp4 or .gif; rendering takes"
+        " some seconds a trial",
     )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Play the trials and print the success rates."""
+    """Play the trials and print the success rates; after Ctrl-C those of what was played."""
+    if arguments.run_folder is not None:
+        _check_run_arguments(arguments)
+        return evaluate_run(arguments)
     config = playing_config(arguments)
     suite = None if arguments.suite is None else config.suite(arguments.suite)
     if suite is not None and arguments.backend is None:
         config = in_world_of(suite, config)
     jobs = _jobs(config, arguments, suite)
-    tally, first = Tally(), None
-    trials: list[CountedTrial] = []
+    make_policy(arguments.policy, make_task(config.task))  # a wrong name starts no worker
     started = time.monotonic()
-    played = play_all(config, arguments.policy, jobs, workers=arguments.workers)
-    with progress_bar(f"evaluating {arguments.policy}", len(jobs)) as advance, closing(played):
-        for job, episode in played:
-            tally.add(episode.outcome)
-            trials.append(CountedTrial.of(episode, run_id=episode.policy))
-            first = episode if job is jobs[0] else first
-            advance()
+    trials: list[CountedTrial] = []
+    shown: dict[int, Episode] = {}
+    status = 0
+    try:
+        played = play_all(config, arguments.policy, jobs, workers=arguments.workers)
+        with progress_bar(f"evaluating {arguments.policy}", len(jobs)) as advance, closing(played):
+            for job, episode in played:
+                trials.append(CountedTrial.of(episode, run_id=episode.policy))
+                if arguments.video is not None:
+                    shown[job.seed] = episode
+                advance()
+    except KeyboardInterrupt:
+        status = INTERRUPTED
+        print(f"stopped after {len(trials)} of {len(jobs)} trials", file=sys.stderr)
     if arguments.outcomes is not None:
         _write_outcomes(arguments.outcomes, trials)
+    tally = Tally.of(trial.outcome for trial in trials)
     result = result_json(config, arguments.policy, tally, time.monotonic() - started, suite)
     if arguments.json:
         print(json.dumps(result))
@@ -108,9 +146,35 @@ def run(arguments: argparse.Namespace) -> int:
         title = "{policy} on {task} in {backend}{named}, {trials} trials, {wall_s:.1f} s"
         title = title.format(**result, named=named)
         make_console().print(success_table(title, tally))
-    if arguments.video is not None and first is not None:
-        write_video(first, arguments.video, config)
-    return 0
+    if shown and status == 0:
+        _write_video([shown[number] for number in sorted(shown)], arguments.video, config)
+    return status
+
+
+def _check_run_arguments(arguments: argparse.Namespace) -> None:
+    """Refuse what --run has no use for: it plays the trials of the run itself."""
+    named = {
+        "--config": arguments.config,
+        "--task": arguments.task,
+        "--seed": arguments.seed,
+        "--situation": arguments.situation,
+        "--outcomes": arguments.outcomes,
+        "--out": arguments.out,
+        "--states": arguments.states or None,
+        "--video": arguments.video,
+    }
+    given = [option for option, value in named.items() if value is not None]
+    if given:
+        raise UserError(
+            f"--run plays the trials of the run's own configuration; {given[0]} goes with --policy:"
+            f" --policy {arguments.run_folder} is the run's newest policy"
+        )
+
+
+def _write_video(episodes: list[Episode], out: Path, config: Config) -> None:
+    frames = sum(episode.steps for episode in episodes)
+    with progress_bar("rendering", frames) as advance:
+        write_video(episodes, out, config, on_frame=advance)
 
 
 def _jobs(config: Config, arguments: argparse.Namespace, suite: Suite | None) -> list[Job]:

@@ -65,7 +65,7 @@ def _export_one(episode: Episode, arguments: argparse.Namespace) -> Path:
         return export_npz(episode, out)
     path = out / f"{episode.id}.mp4"
     simulator = SimulatorConfig(backend=episode.backend)
-    write_video(episode, path, config_of(arguments).model_copy(update={"simulator": simulator}))
+    write_video([episode], path, config_of(arguments).model_copy(update={"simulator": simulator}))
     return path
 
 

@@ -9,7 +9,8 @@ import os
 from proto.bus import Bus, join_hub
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
-from services.arguments.common import add_connection, config_of, listening_address, start_logging
+from services.arguments.common import add_connection, config_of, listening_address
+from services.arguments.logs import start_logging
 from services.board import Board, RunView
 from services.monitoring.exporter import RunCollector, served
 

@@ -32,6 +32,6 @@ def run(arguments: argparse.Namespace) -> int:
     simulator = SimulatorConfig(backend=arguments.backend or episode.backend)
     config = config_of(arguments).model_copy(update={"simulator": simulator})
     with progress_bar("rendering", episode.steps) as advance:
-        write_video(episode, arguments.out, config, fps=arguments.fps, on_frame=advance)
+        write_video([episode], arguments.out, config, fps=arguments.fps, on_frame=advance)
     print(f"{arguments.out}: {episode.steps} frames")
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from contextlib import closing
 from pathlib import Path
 
@@ -38,6 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         " configuration",
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the recordings")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -52,5 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
         for episode in episodes:
             tally.add(episode.outcome)
             advance()
+    if arguments.json:
+        print(json.dumps({"folder": str(arguments.out), **tally.as_json()}))
+        return 0
     make_console().print(success_table(f"{tally.trials} sequences in {arguments.out}", tally))
     return 0

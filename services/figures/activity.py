@@ -26,10 +26,13 @@ from services.figures.rollouts import (
 )
 from services.figures.style import BLACK, figure_style
 
-SUBNETS: Final = ("mstnn_fast", "pfc", "mtrnn_fast")
+SUBNETS: Final = ("mstnn_fast", "pfc", "mtrnn_slow", "mtrnn_fast")
 """The subnets that the figure shows."""
-UNITS_SHOWN: Final = 50
+UNITS_SHOWN: Final = 51
 """Largest number of units shown of a subnet: those that vary most."""
+GROUPS: Final = {"mstnn_fast": 3}
+"""Groups of equal size from which the shown units of a subnet are taken. The units of V_F are in
+the order of its maps, of which the paper's network has three."""
 OUTPUTS: Final[Mapping[str, slice]] = {
     "neck\n(degrees)": NECK,
     "arm\n(degrees)": ARM,
@@ -51,8 +54,11 @@ def shown_units(activities: Sequence[Activity]) -> dict[str, NDArray[np.int64]]:
     shown = {}
     for name in SUBNETS:
         states = np.concatenate([activity.states[name] for activity in activities])
-        most_varying = np.argsort(states.std(axis=0))[-UNITS_SHOWN:]
-        shown[name] = np.sort(most_varying)
+        deviations = states.std(axis=0)
+        groups = np.array_split(np.arange(len(deviations)), GROUPS.get(name, 1))
+        most = UNITS_SHOWN // len(groups)
+        chosen = [group[np.argsort(deviations[group])[-most:]] for group in groups]
+        shown[name] = np.sort(np.concatenate(chosen))
     return shown
 
 
@@ -111,14 +117,14 @@ def draw(activities: Sequence[Activity]) -> Figure:
     """Draw one column for each episode: units of the subnets over time, outputs and phases."""
     with figure_style():
         shown = shown_units(activities)
-        figure = Figure(figsize=(1.4 + 3.2 * len(activities), 7.4), layout="constrained")
+        figure = Figure(figsize=(1.4 + 3.2 * len(activities), 8.4), layout="constrained")
         axes = figure.subplots(
             len(SUBNETS) + len(OUTPUTS),
             len(activities) + 1,
             sharex="col",
             sharey="row",
             squeeze=False,
-            height_ratios=[2.2, 1.4, 2.2, 1, 1.7, 0.8, 0.8],
+            height_ratios=[2.2, 1.4, 1.6, 2.2, 1, 1.7, 0.8, 0.8],
             width_ratios=[*(1.0 for _ in activities), 0.3],
         )
         columns, margin = axes.T[:-1], axes.T[-1]
@@ -169,6 +175,9 @@ def _draw_column(
             extent=(0, steps, len(units), 0),
         )
         axes.set_yticks([])
+        size = len(units) / GROUPS.get(name, 1)
+        for border in range(1, GROUPS.get(name, 1)):
+            axes.axhline(border * size, color=BLACK, linewidth=0.6)
         axes.spines[["top", "right"]].set_visible(True)
     for axes, (name, values) in zip(column[len(SUBNETS) :], OUTPUTS.items(), strict=True):
         actions = activity.episode.actions[:, values]
@@ -206,7 +215,8 @@ def _row_label(name: str, activity: Activity, shown: Mapping[str, NDArray[np.int
     units = activity.states[name].shape[1]
     if units == len(shown[name]):
         return f"{SYMBOLS[name]}\n{units} units"
-    return f"{SYMBOLS[name]}\n{len(shown[name])} of {units} units"
+    maps = f"\n{GROUPS[name]} maps" if name in GROUPS else ""
+    return f"{SYMBOLS[name]}\n{len(shown[name])} of {units} units{maps}"
 
 
 def _numbers_of(activity: Activity, shown: Mapping[str, NDArray[np.int64]]) -> dict[str, Any]:

@@ -5,19 +5,33 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import cycle
+from itertools import count, cycle
 from typing import Any, Final
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from rich.table import Table
 
-from services.figures.style import BLACK, BLUE, GREEN, ORANGE, PINK, RED, SKY, figure_style, percent
+from services.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    figure_style,
+    percent,
+    show_percent,
+)
 from services.terminal.rates import rate_text
 from services.trials.round_trials import RoundPolicy, Run
 from services.trials.success import Tally
 
 READINGS: Final = ("strict", "precise")
+APART: Final = 0.3
+"""Curves are drawn so far apart (cases) that those with equal values do not hide each other."""
 _COLOURS: Final = (BLUE, ORANGE, GREEN, PINK, SKY, RED, BLACK)
 _MARKERS: Final = "osD^vPX"
 
@@ -86,20 +100,35 @@ def draw(curves: Sequence[Curve]) -> Figure:
         panels = figure.subplots(1, len(READINGS), sharey=True)
         for axes, reading in zip(panels, READINGS, strict=True):
             styles = zip(cycle(_COLOURS), cycle(_MARKERS), strict=False)
-            for curve, label, (colour, marker) in zip(curves, labels, styles, strict=False):
-                _draw_curve(axes, curve, reading, label=label, color=colour, marker=marker)
+            drawn = zip(count(), curves, labels, styles, strict=False)
+            for number, curve, label, (colour, marker) in drawn:
+                style = {"label": label, "color": colour, "marker": marker}
+                _draw_curve(axes, curve, reading, APART * (number - (len(curves) - 1) / 2), **style)
             axes.set_title(reading)
             axes.set_xlabel("tutored cases")
-            axes.set_ylim(0, 102)
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+            show_percent(axes, _lowest(curves))
         panels[0].set_ylabel("success (%)")
         handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
+        figure.legend(
+            handles,
+            labels,
+            loc="outside lower center",
+            ncols=min(len(labels), 4),
+            title="situations of the corrections",
+        )
         return figure
 
 
-def _draw_curve(axes: Axes, curve: Curve, reading: str, **style: Any) -> None:
+def _lowest(curves: Sequence[Curve]) -> float:
+    """The lowest end of an interval that is drawn (percent)."""
+    rates = [tally.rate(each) for curve in curves for tally in curve.tallies for each in READINGS]
+    return 100 * min(rate.wilson95[0] for rate in rates)
+
+
+def _draw_curve(axes: Axes, curve: Curve, reading: str, offset: float, **style: Any) -> None:
     middle, reach = percent(tally.rate(reading) for tally in curve.tallies)
-    cases = [policy.cases for policy in curve.run.policies]
+    cases = [policy.cases + offset for policy in curve.run.policies]
     axes.errorbar(
         cases, middle, yerr=reach, linewidth=1.0, markersize=4, elinewidth=0.9, capsize=2, **style
     )
@@ -107,11 +136,9 @@ def _draw_curve(axes: Axes, curve: Curve, reading: str, **style: Any) -> None:
 
 def _labels(curves: Sequence[Curve]) -> list[str]:
     """Return a label for each run: how its situations were chosen, with its name if ambiguous."""
-    count = Counter(curve.choose for curve in curves)
+    runs = Counter(curve.choose for curve in curves)
     return [
-        curve.choose
-        if count[curve.choose] == 1
-        else f"{curve.choose} ({curve.run.config.run.name})"
+        curve.choose if runs[curve.choose] == 1 else f"{curve.choose} ({curve.run.config.run.name})"
         for curve in curves
     ]
 

@@ -34,6 +34,7 @@ from services.figures.style import (
     figure_style,
     label,
     percent,
+    show_percent,
     words_and_unit,
 )
 from services.terminal.rates import rate_text
@@ -47,6 +48,7 @@ SHOWN: Final = 2.5
 """Largest error that is shown, in multiples of the allowed error; larger ones are clipped."""
 _MARKS: Final = ((GREEN, "o"), (ORANGE, "o"), (BLUE, "^"), (BLACK, "x"), (RED, "s"), (PINK, "D"))
 """Colour and marker of each of the task's reasons in their order; repeated if there are more."""
+_READING_MARKS: Final[Mapping[str, str]] = {"strict": "o", "precise": "D"}
 _Z95: Final = 1.96
 _EXPLANATION: Final = (
     "Dotted: tutored values. Errors are shown for trials in which the object had not moved before"
@@ -298,6 +300,7 @@ def draw(trials: Trials, title: str) -> Figure:
             for each, error in zip(column[1:], errors, strict=True):
                 _draw_errors(each, trials, axis, error)
             _label_axis(column[-1].xaxis, column[-1].set_xlabel, axis)
+        show_percent(axes[0, 0], _lowest(trials))  # the panels of a row share their axis
         axes[0, 0].set_ylabel("success (%)")
         for row, error in zip(axes[1:], errors, strict=True):
             row[0].set_ylabel(error.label)
@@ -352,7 +355,7 @@ def _label_axis(side: Any, set_label: Callable[[str], object], axis: Axis) -> No
 def _draw_rates(axes: Axes, trials: Trials, axis: Axis) -> None:
     bins = _bins(axis)
     centres = np.array([(each.low + each.high) / 2 for each in bins])
-    offset = 0.02 * float(np.diff(axis.tutored).min())
+    offset = 0.06 * float(np.diff(axis.tutored).min())
     for side, reading in enumerate(READINGS):
         middle, reach = percent(trials.rate(reading, each.chosen) for each in bins)
         axes.errorbar(
@@ -360,14 +363,25 @@ def _draw_rates(axes: Axes, trials: Trials, axis: Axis) -> None:
             middle,
             yerr=reach,
             color=READING_COLOURS[reading],
-            marker="o",
-            markersize=3,
-            linewidth=0.0 if axis.discrete else 1.0,
+            marker=_READING_MARKS[reading],
+            markersize=3.5,
+            # Where both are equal, both lines are seen: the second is dashed, on the first.
+            linewidth=0.0 if axis.discrete else (1.0, 1.4)[side],
+            linestyle=("solid", (0, (3, 3)))[side],
             elinewidth=0.8,
             label=reading,
         )
-    axes.set_ylim(0, 102)
     _mark_tutored(axes.axvline, axis.tutored)
+
+
+def _lowest(trials: Trials) -> float:
+    """The lowest end of an interval of success (percent)."""
+    return 100 * min(
+        trials.rate(reading, each.chosen).wilson95[0]
+        for axis in trials.axes.values()
+        for reading in READINGS
+        for each in _bins(axis)
+    )
 
 
 def _draw_errors(axes: Axes, trials: Trials, axis: Axis, error: GraspError) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -9,7 +10,9 @@ from typing import Any, Final
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from proto.errors import UserError
@@ -58,6 +61,18 @@ def percent(rates: Iterable[Rate]) -> tuple[Array, Array]:
     middle, low, high = 100 * np.array([(rate.rate, *rate.wilson95) for rate in rates]).T
     # At 0 and 100 % rounding can make a bar slightly negative.
     return middle, np.maximum([middle - low, high - middle], 0.0)
+
+
+def show_percent(axes: Axes, lowest: float) -> None:
+    """Let an axis show success from a bit below the lowest value up to 100 %, in whole numbers.
+
+    Args:
+        axes: the panel.
+        lowest: lowest value that is drawn (percent).
+    """
+    bottom = max(0.0, math.floor(lowest) - 0.02 * (100 - lowest))
+    axes.set_ylim(bottom, 100 + 0.04 * (100 - bottom))
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
 
 
 def check_name(path: Path) -> None:

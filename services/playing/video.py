@@ -26,31 +26,37 @@ from services.playing.video_file import Picture, check_video_name, video_file
 
 PANEL_WIDTH: Final = 640
 PANEL_HEIGHT: Final = 480
+HOLD_S: Final = 1.0
+"""The last picture of an episode, with the outcome, stays for this time."""
 _LINE: Final = 24
-_LINE_LETTERS: Final = 78
+_LINE_LETTERS: Final = 150
 """So many letters of the caption fit beside each other."""
 _MARGIN: Final = 12
+CAPTION_HEIGHT: Final = 4 * _LINE + _MARGIN
+"""Height of the caption below the pictures: four lines."""
 _WHITE: Final = (255, 255, 255)
+_BAND: Final = 40
 
 
 def write_video(
-    episode: Episode,
+    episodes: Sequence[Episode],
     out: Path,
     config: Config,
     *,
     fps: float | None = None,
     on_frame: Callable[[], None] = lambda: None,
 ) -> None:
-    """Render every step of a recorded episode into a video.
+    """Render every step of recorded episodes into a video, one episode after the other.
 
     Nothing is simulated: the simulator shows the recorded joints and bodies of each step.
 
     Args:
-        episode: the recorded episode.
+        episodes: the recorded episodes, at least one; all of the same task and simulator.
         out: the file to write, .mp4 (H.264) or .gif; it appears under its name only when it is
             complete.
         config: the simulator that renders, and options of the task.
-        fps: frames per second, one frame for each control step; None for real time.
+        fps: frames per second, one frame for each control step; None for real time. The last frame
+            of each episode stays for HOLD_S.
         on_frame: called after each frame.
 
     Raises:
@@ -58,33 +64,50 @@ def write_video(
             needs an option of the task, or the file cannot be written.
     """
     check_video_name(out)
-    if not episode.situation:
-        raise UserError(f"the situation of {episode.id} is not known, so there is no scene to show")
-    rate = fps or 1.0 / episode.control_period_s
+    for episode in episodes:
+        if not episode.situation:
+            raise UserError(
+                f"the situation of {episode.id} is not known, so there is no scene to show"
+            )
+    rate = fps or 1.0 / episodes[0].control_period_s
+    task = make_task(config.task_called(episodes[0].task))
     with (
         closing(make_simulator(config.simulator.model_copy(update={"render": True}))) as simulator,
         video_file(out, rate) as write,
     ):
-        for frame in frames(episode, simulator, make_task(config.task_called(episode.task))):
-            write(frame)
-            on_frame()
+        for number, episode in enumerate(episodes, 1):
+            title = f"{number} of {len(episodes)}: " if len(episodes) > 1 else ""
+            for frame in frames(episode, simulator, task, title):
+                write(frame)
+                on_frame()
+            for _ in range(round(HOLD_S * rate)):
+                write(frame)
 
 
-def frames(episode: Episode, simulator: Simulator, task: Task) -> Iterator[Picture]:
-    """Yield one picture (480, 1280, 3) uint8, RGB, for each step of an episode of a task."""
+def frames(
+    episode: Episode, simulator: Simulator, task: Task, title: str = ""
+) -> Iterator[Picture]:
+    """Yield one picture (588, 1280, 3) uint8, RGB, for each step of an episode of a task.
+
+    Args:
+        episode: the episode.
+        simulator: renders it.
+        task: its task.
+        title: text at the beginning of the caption.
+    """
     staging = stage(task, episode.situation, episode.conditions, episode.seed)
     simulator.reset(staging.scene)
     for step in range(episode.steps):
         poses = _poses(episode, step)
         joints_deg = episode.joints_deg[step].astype(np.float64)
         simulator.show(joints_deg, poses, step)
-        outside = simulator.outside_picture(PANEL_WIDTH, PANEL_HEIGHT).copy()
-        _write_lines(outside, _caption(episode, step))
+        outside = simulator.outside_picture(PANEL_WIDTH, PANEL_HEIGHT)
         focus = _focus_before(episode, step, float(task.start[FOCUS]))
         eye = simulator.eye_picture(Crop(), PANEL_WIDTH, PANEL_HEIGHT).copy()
-        _draw_focus(eye, focus)
+        _draw_crop(eye, focus)
         _insert_recorded_image(eye, episode.images[step])
-        yield np.hstack([outside, eye])
+        caption = _caption_picture(episode, step, focus, title)
+        yield np.vstack([np.hstack([outside, eye]), caption])
 
 
 def _poses(episode: Episode, step: int) -> Mapping[str, Pose]:
@@ -96,14 +119,13 @@ def _poses(episode: Episode, step: int) -> Mapping[str, Pose]:
     return poses
 
 
-def _draw_focus(eye: Picture, focus: float) -> None:
-    """Draw a rectangle around the crop of the focus level."""
+def _draw_crop(eye: Picture, focus: float) -> None:
+    """Draw a white frame around the crop of the focus level."""
     crop = crop_of_focus(focus)
     across, down = crop.width / EYE_WIDTH / 2, crop.height / EYE_HEIGHT / 2
     corner = (round(PANEL_WIDTH * (0.5 - across)), round(PANEL_HEIGHT * (0.5 - down)))
     opposite = (round(PANEL_WIDTH * (0.5 + across)) - 1, round(PANEL_HEIGHT * (0.5 + down)) - 1)
     cv2.rectangle(eye, corner, opposite, _WHITE, 1)
-    _write_lines(eye, [f"left eye, focus {focus:.0f}"])
 
 
 def _insert_recorded_image(eye: Picture, image: Picture) -> None:
@@ -118,16 +140,38 @@ def _focus_before(episode: Episode, step: int, start: float) -> float:
     return start if step == 0 else float(episode.actions[step - 1, FOCUS])
 
 
-def _caption(episode: Episode, step: int) -> list[str]:
+def _caption_picture(episode: Episode, step: int, focus: float, title: str) -> Picture:
+    """The caption in white on a dark band (CAPTION_HEIGHT, 1280, 3)."""
+    picture = np.full((CAPTION_HEIGHT, 2 * PANEL_WIDTH, 3), _BAND, dtype=np.uint8)
+    what, progress = _played(episode, title), _progress(episode, step)
+    situation = wrap(situation_text(episode.situation), _LINE_LETTERS, max_lines=2)
+    _write_lines(picture, [what, progress, *situation])
+    _write_lines(picture[:, PANEL_WIDTH:], [_eye_words(focus), "small picture: what it gets"])
+    return picture
+
+
+def _played(episode: Episode, title: str) -> str:
+    """Such as `1 of 3: experiment1 in sapien, trial by network version 4`."""
     policy = episode.policy
     if episode.policy_version:
         policy += f" version {episode.policy_version}"
-    return [
-        f"{episode.task} in {episode.backend}, {episode.kind} by {policy}{_disturbance(episode)}",
-        *wrap(situation_text(episode.situation), _LINE_LETTERS),
-        f"step {step + 1} of {episode.steps}, {episode.phase_names[episode.phases[step]]}, "
-        f"outcome: {_in_words(episode.outcome)}",
-    ]
+    return (
+        f"{title}{episode.task} in {episode.backend},"
+        f" {episode.kind} by {policy}{_disturbance(episode)}"
+    )
+
+
+def _progress(episode: Episode, step: int) -> str:
+    """Step and phase, and in the last step the outcome, which is known only then."""
+    phase = episode.phase_names[episode.phases[step]]
+    words = f"step {step + 1} of {episode.steps}: {phase}"
+    if step == episode.steps - 1:
+        words += f". Outcome: {_in_words(episode.outcome)}"
+    return words
+
+
+def _eye_words(focus: float) -> str:
+    return f"left eye; white frame: what the network sees, focus level {focus:.0f}"
 
 
 def _disturbance(episode: Episode) -> str:
@@ -148,9 +192,6 @@ def _in_words(outcome: Outcome) -> str:
 
 
 def _write_lines(picture: Picture, lines: Sequence[str]) -> None:
-    """Write lines of white text on a darkened band at the top of the picture."""
-    band = picture[: len(lines) * _LINE + _MARGIN]
-    band //= 2
     for number, line in enumerate(lines, 1):
         place = (_MARGIN, number * _LINE)
         cv2.putText(picture, line, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, _WHITE, 1, cv2.LINE_AA)

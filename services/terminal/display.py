@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from typing import Final
 
@@ -12,9 +12,11 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from proto.keys import Role
 from proto.plain_text import plain
 from services.board import RunView
-from services.terminal.run_tables import run_tables
+from services.terminal.run_progress import ProgressMeter
+from services.terminal.run_tables import fitting_tables
 from services.terminal.run_words import run_line
 
 LOG = logging.getLogger(__name__)
@@ -25,13 +27,21 @@ LINES_PERIOD_S: Final = 5.0
 Show = Callable[[RunView], None]
 
 
-def display(console: Console) -> AbstractContextManager[Show]:
+def display(
+    console: Console, meter: ProgressMeter, expected: Mapping[Role, int]
+) -> AbstractContextManager[Show]:
     """Gives a function to call with each new view of a run.
 
     On a terminal it updates tables in place; elsewhere it prints a line now and then. A view that
     cannot be shown is logged and left out, because showing must not end a run.
+
+    Args:
+        console: where to show it.
+        meter: estimates what is left of the run.
+        expected: number of processes by role that were started; empty if this is not known.
     """
-    return _safe(_tables(console) if console.is_terminal else _lines(console))
+    show = _tables if console.is_terminal else _lines
+    return _safe(show(console, meter, expected))
 
 
 @contextmanager
@@ -50,22 +60,26 @@ def _safe(display: AbstractContextManager[Show]) -> Iterator[Show]:
 
 
 @contextmanager
-def _tables(console: Console) -> Iterator[Show]:
+def _tables(console: Console, meter: ProgressMeter, expected: Mapping[Role, int]) -> Iterator[Show]:
     with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
-        yield lambda view: live.update(run_tables(view), refresh=True)
+        yield lambda view: live.update(
+            fitting_tables(view, console, meter.look(view), expected), refresh=True
+        )
 
 
 @contextmanager
-def _lines(console: Console) -> Iterator[Show]:
-    due_s = time.monotonic() + LINES_PERIOD_S
+def _lines(console: Console, meter: ProgressMeter, expected: Mapping[Role, int]) -> Iterator[Show]:
+    due_s = time.monotonic()
     last = ""
 
     def show(view: RunView) -> None:
         nonlocal due_s, last
-        line = run_line(view)
-        if time.monotonic() >= due_s and line != last:
+        progress = meter.look(view)
+        state = run_line(view, expected=expected)
+        if time.monotonic() >= due_s and state != last:
+            line = run_line(view, progress, expected)
             text = Text(plain(f"{time.strftime('%H:%M:%S')} {line}"))
             console.print(text, soft_wrap=True, highlight=False)
-            due_s, last = time.monotonic() + LINES_PERIOD_S, line
+            due_s, last = time.monotonic() + LINES_PERIOD_S, state
 
     yield show

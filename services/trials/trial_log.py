@@ -168,15 +168,19 @@ class TrialLog:
         damaged: number of lines that could not be read; they stay in the file and are not counted.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, read_only: bool = False) -> None:
         """Open a trial log, or create it.
 
         A last line that is incomplete, because a process was killed, is dropped.
+
+        Args:
+            path: the file.
+            read_only: change nothing on disk, because another process may write to the file.
         """
         self._path = path
         self.damaged = 0
-        self._outcomes: dict[tuple[str, int, str], dict[int, Outcome]] = defaultdict(dict)
-        if drop_unfinished_line(path):
+        self._trials: dict[tuple[str, int, str], dict[int, CountedTrial]] = defaultdict(dict)
+        if not read_only and drop_unfinished_line(path):
             LOG.warning("%s: dropped its last line, which was not finished", path)
         content = path.read_bytes() if path.exists() else b""
         for number, line in enumerate(content.splitlines(), 1):
@@ -206,7 +210,7 @@ class TrialLog:
         """
         new: dict[tuple[str, int, str, int], EpisodeOutcome] = {}
         for each in played:
-            counted = self._outcomes.get((each.training, each.policy_version, each.suite), {})
+            counted = self._trials.get((each.training, each.policy_version, each.suite), {})
             if each.seed not in counted:
                 key = (each.training, each.policy_version, each.suite, each.seed)
                 new.setdefault(key, each)
@@ -235,18 +239,25 @@ class TrialLog:
 
     def versions(self, run_id: str, suite: str = UNLEARNED) -> list[int]:
         """Return the policy versions of a training with counted trials in a suite, oldest first."""
-        keys = list(self._outcomes)  # a copy, because another thread may add to it
+        keys = list(self._trials)  # a copy, because another thread may add to it
         return sorted(version for run, version, name in keys if (run, name) == (run_id, suite))
 
     def tried_versions(self, run_id: str) -> list[int]:
         """Return the policy versions of a training with trials in any suite, oldest first."""
-        return sorted({version for run, version, _ in list(self._outcomes) if run == run_id})
+        return sorted({version for run, version, _ in list(self._trials) if run == run_id})
 
     def outcomes(
         self, run_id: str, policy_version: int, suite: str = UNLEARNED
     ) -> Mapping[int, Outcome]:
         """Return the outcomes of a policy version in a suite by the trial's seed."""
-        return dict(self._outcomes.get((run_id, policy_version, suite), {}))
+        counted = self._trials.get((run_id, policy_version, suite), {})
+        return {seed: trial.outcome for seed, trial in list(counted.items())}
+
+    def trials(
+        self, run_id: str, policy_version: int, suite: str = UNLEARNED
+    ) -> list[CountedTrial]:
+        """Return the counted trials of a policy version in a suite, in the order of the file."""
+        return list(self._trials.get((run_id, policy_version, suite), {}).values())
 
     def _add(self, trial: CountedTrial) -> bool:
         if trial.seed in self.outcomes(trial.run_id, trial.policy_version, trial.suite):
@@ -255,10 +266,8 @@ class TrialLog:
         return self._count(trial)
 
     def _count(self, trial: CountedTrial) -> bool:
-        outcomes = self._outcomes[trial.run_id, trial.policy_version, trial.suite]
-        new = trial.seed not in outcomes
-        outcomes.setdefault(trial.seed, trial.outcome)
-        return new
+        counted = self._trials[trial.run_id, trial.policy_version, trial.suite]
+        return counted.setdefault(trial.seed, trial) is trial
 
     def _read(self, line: bytes, number: int) -> None:
         if len(line) < _SHORTEST_LINE:

@@ -10,6 +10,7 @@ from pathlib import Path
 from proto.config import Config
 from proto.episode import Outcome
 from proto.messages import Rollout
+from proto.suites import UNLEARNED, Suite
 from services.playing.workers import play_all
 from services.trials.evaluation import trial_jobs
 from services.trials.trial_log import TrialLog
@@ -39,6 +40,7 @@ def play_missing_trials(
     *,
     workers: int,
     on_trial: Callable[[], None],
+    suite: Suite | None = None,
 ) -> list[Outcome]:
     """Play the trials of a policy that are not in its log; return the outcomes of all its trials.
 
@@ -50,13 +52,15 @@ def play_missing_trials(
         seed: seed of the first trial; the same seed gives every policy the same situations.
         workers: number of processes.
         on_trial: called for each trial, also for those in the log.
+        suite: the suite whose conditions the trials have; None for no disturbances.
 
     Raises:
         UserError: see `play_all`.
     """
     log = TrialLog(log_file)
-    logged = log.outcomes(policy.run_id, policy.version)
-    jobs = trial_jobs(config, trials, seed)
+    name = UNLEARNED if suite is None else suite.name
+    logged = log.outcomes(policy.run_id, policy.version, name)
+    jobs = trial_jobs(config, trials, seed, suite=suite)
     missing = [job for job in jobs if job.seed not in logged]
     for _ in range(len(jobs) - len(missing)):
         on_trial()
@@ -64,5 +68,5 @@ def play_missing_trials(
         for _, episode in played:
             log.add(Rollout(episode, policy.run_id))
             on_trial()
-    logged = log.outcomes(policy.run_id, policy.version)
+    logged = log.outcomes(policy.run_id, policy.version, name)
     return [logged[job.seed] for job in jobs]

@@ -85,6 +85,7 @@ class ActorSetup:
         self.cases: list[TutoringCase | Correction] = []
         self.requests: list[TutoringRequest] = []
         self.trials: list[Trial] = []
+        self.first_trials: dict[int, list[Trial]] = {}
         self.sequences: list[Episode] = []
         self.rollouts: list[Rollout] = []
         self.outcomes: list[EpisodeOutcome] = []
@@ -110,7 +111,7 @@ class ActorSetup:
         self._lock = threading.Lock()
         keys = self.bus.keys
         self.bus.answer(keys.request_tutoring, TutoringRequest, self._on_request)
-        self.bus.answer(keys.request_trial, TrialRequest, lambda _: self._next(self.trials))
+        self.bus.answer(keys.request_trial, TrialRequest, self._on_trial_request)
         self.bus.subscribe(keys.sequence(), self._on_sequence, Sequence)
         self.bus.subscribe(keys.rollout(), self._on_rollout, Rollout)
         self.bus.subscribe(keys.outcome(), self._on_outcome, EpisodeOutcome)
@@ -146,6 +147,9 @@ class ActorSetup:
     def _on_request(self, request: TutoringRequest) -> object | None:
         self.requests.append(request)
         return self._next(self.cases)
+
+    def _on_trial_request(self, request: TrialRequest) -> object | None:
+        return self._next(self.first_trials.get(request.policy_version, self.trials))
 
     def _next(self, things: list[Any]) -> object | None:
         with self._lock:
@@ -377,6 +381,21 @@ def test_the_newest_of_several_policies_is_used(
     setup.wait_for_metrics(lambda metrics: metrics.policy_version > 0)
     eventually(lambda: len(setup.rollouts) >= 2, "it practises")
     assert {rollout.episode.policy_version for rollout in setup.rollouts} == {3}
+
+
+def test_first_trials_of_each_policy_come_before_a_newer_one(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.first_trials = {1: [Trial(70), Trial(71)], 2: [], 3: [Trial(70)]}
+    setup.start_actor("--set", "evaluator.first_trials=2", "--set", "actor.practice=false")
+    eventually(lambda: bool(setup.lives), "a demonstration is going on")
+    for version in (1, 2, 3, 4):
+        setup.publish(policy(version))
+    setup.wait_for_metrics(lambda metrics: metrics.policy_version == 4)
+    eventually(lambda: len(setup.rollouts) == 3, "all trials are played")
+    played = [(r.episode.policy_version, r.episode.seed) for r in setup.rollouts]
+    assert played == [(1, 70), (1, 71), (3, 70)]
 
 
 def test_a_refused_message_is_put_aside_and_delays_no_others(setup: ActorSetup) -> None:
@@ -618,3 +637,14 @@ def test_a_rollout_stays_until_the_recorder_has_it_too(
     assert setup.outcomes[0] == EpisodeOutcome.of(setup.rollouts[0].episode)
     setup.recorders.append(Role.RECORDER)
     setup.wait_for_metrics(lambda metrics: metrics.outbox == 0)
+
+
+def test_an_actor_of_a_run_that_nobody_serves_says_so(tmp_path: Path) -> None:
+    endpoint, log = free_endpoint(), tmp_path / "actor.log"
+    words = (
+        *("--connect", endpoint, "--set", f"run.folder={tmp_path}", "--set", "run.name=lonely"),
+        *("--set", "simulator.render=false"),
+    )
+    with listening_hub(endpoint), vmdnn("actor", *words, log=log):
+        said = "waiting for a learner or an evaluator of the run lonely: nobody serves it (since 5"
+        eventually(lambda: said in log.read_text(), "it says that nobody serves the run")

@@ -10,14 +10,16 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from ports import free_endpoint
 from processes import eventually
+from run_metrics import EVALUATOR, LEARNER, score, view_of
 
 from deploy.processes import programs
-from deploy.run_local import DEFAULT_CONFIG, actors_of, check_actors, main
+from deploy.run_local import DEFAULT_CONFIG, actors_of, check_actors, main, summary
 from proto.config import Config, LearnerConfig, load_config
 from proto.run_locks import owned_run
 
@@ -234,6 +236,21 @@ def test_actors_from_elsewhere_are_believed() -> None:
     assert actors_of(3, config) == {"sapien": 3}
 
 
+def test_the_summary_says_what_to_expect_and_what_is_missing() -> None:
+    suite = replace(EVALUATOR.suites[0], trials=10, policies=(score(1, 0, 2), score(4, 0, 10)))
+    view = view_of(replace(LEARNER, policy_version=4), replace(EVALUATOR, suites=(suite,)))
+    told = summary(view, load_config(SMOKE), 301.0)
+    assert "4 policy versions in 5 min 1 s" in told
+    assert "3 earlier versions have fewer than 10 trials" in told
+    assert "  vmdnn evaluate --run runs/smoke --policy-version all\n" in told
+    assert "no success is expected here: 3 tutored cases" in told
+    assert "  vmdnn evaluate --policy pretrained:experiment1" in told
+    prose = [line for line in told.splitlines() if not line.startswith(" ")]
+    assert max(map(len, prose)) < 80
+    whole = summary(view, load_config(DEFAULT_CONFIG), 301.0)
+    assert "expected" not in whole
+
+
 def test_a_run_that_is_being_played_is_not_touched_by_a_second_start(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -332,5 +349,5 @@ def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> N
     assert "policy 4, 10 of 10 trials counted" in output
     assert not processes_that_name(str(tmp_path))
     counted = (run / "evaluation" / "trials.jsonl").read_text().splitlines()
-    recorded = {path.stem for path in (run / "rollouts").glob("*.mcap")}
+    recorded = {path.stem.rpartition("_")[2] for path in (run / "rollouts").glob("*.mcap")}
     assert {json.loads(line)["episode"] for line in counted} <= recorded

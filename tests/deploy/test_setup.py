@@ -152,3 +152,33 @@ def test_the_message_of_a_backend_without_packages_is_printed(bare: Path) -> Non
     assert answer.stderr == (
         "no light.\nbuy a lamp\nsetup: the simulator cannot render; see above\n"
     )
+
+
+PIP_OUTPUT = """
+Collecting torch==2.13.0 (from -c requirements.lock (line 5))
+  Downloading torch-2.13.0-cp311-cp311-linux_x86_64.whl (188.4 MB)
+  Downloading filelock-3.20.0-py3-none-any.whl (16 kB)
+  Downloading numpy-2.0.0.whl (9.5 MB)
+"""
+
+
+def test_progress_is_told_while_packages_come(bare: Path) -> None:
+    """Without a terminal; on one pip shows its own bars."""
+    lines = PIP_OUTPUT + "".join(f"Collecting package-{n}\n" for n in range(2, 21))
+    (bare / "output").write_text(f"{lines}Installing collected packages: torch\n")
+    script = (
+        f"set -euo pipefail; source {DEPLOY / 'setup.sh'}; VENV={bare}\n"
+        f"run_pip() {{ cat {bare / 'output'}; return $STATUS; }}\n"
+        "pip_install torch"
+    )
+    answer = call("bash", "-c", script, cwd=bare, STATUS="0")
+    assert answer.returncode == 0, answer.stderr
+    assert answer.stderr.splitlines() == [
+        "setup: downloading torch-2.13.0-cp311-cp311-linux_x86_64.whl (188.4 MB)",
+        "setup: 10 packages so far",
+        "setup: 20 packages so far",
+        "setup: unpacking",
+    ]
+    failed = call("bash", "-c", script, cwd=bare, STATUS="1")
+    assert failed.returncode == 1
+    assert "pip could not install" in failed.stderr

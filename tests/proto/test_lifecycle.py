@@ -49,6 +49,20 @@ def test_a_wait_is_logged_when_it_lasts_and_when_it_is_over(
     ]
 
 
+def test_a_wait_that_needs_somebody_is_logged_again_and_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    clock = [0.0]
+    lifecycle = Lifecycle(clock=lambda: clock[0])
+    for second in range(70):
+        clock[0] = second
+        lifecycle.waits_for("a learner", log_again_s=30.0)
+    assert caplog.messages == [
+        f"waiting for a learner (since {second} s)" for second in (5, 35, 65)
+    ]
+
+
 def test_a_main_loop_that_does_not_go_on_is_seen() -> None:
     now_s = 0.0
     lifecycle = Lifecycle(clock=lambda: now_s)

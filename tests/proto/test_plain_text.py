@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+from argparse import Namespace
 
 import pytest
 from hypothesis import given, settings
@@ -12,11 +13,13 @@ from rich.console import Console
 from rich.table import Table
 from run_metrics import ACTOR, EVALUATOR, LEARNER, view_of
 
+from proto.keys import Role
 from proto.plain_text import plain, plain_lines
-from services.arguments.common import start_logging
+from services.arguments.logs import ProcessLog
 from services.board import RunView
 from services.terminal.console import make_console
 from services.terminal.display import display
+from services.terminal.run_progress import ProgressMeter
 from services.terminal.run_tables import run_tables
 from services.terminal.run_words import run_line
 
@@ -54,7 +57,7 @@ def test_a_view_shows_hostile_texts_as_texts(text: str) -> None:
     console = make_console()
     console.file = io.StringIO()
     console.print(run_tables(hostile_view(text)))
-    with display(console) as show:
+    with display(console, ProgressMeter(), {}) as show:
         show(hostile_view(text))
     assert "\x1b" not in console.file.getvalue()
     assert plain(run_line(hostile_view(text))).isprintable()
@@ -71,7 +74,7 @@ def test_a_table_shows_markup_as_text() -> None:
 
 def test_a_view_that_cannot_be_shown_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     broken = RunView("run", None, {})  # type: ignore[arg-type]
-    with display(Console(file=io.StringIO(), force_terminal=True)) as show:
+    with display(Console(file=io.StringIO(), force_terminal=True), ProgressMeter(), {}) as show:
         show(broken)
     assert "cannot be shown" in caplog.text
 
@@ -80,7 +83,7 @@ def test_a_log_record_cannot_look_like_two(capfd: pytest.CaptureFixture[str]) ->
     root = logging.getLogger()
     before = root.handlers[:], root.level
     try:
-        start_logging("actor")
+        ProcessLog(Role.ACTOR, Namespace(log_format="text", quiet=False, verbose=False))
         forged = "2026-01-01 00:00:00,000 learner ERROR lost everything"
         logging.getLogger("test").warning("refused: %s", f"x\n{forged}\x1b[2J")
         try:

@@ -205,6 +205,25 @@ def test_every_policy_gets_the_same_situations_each_counted_once(setup: Evaluato
     assert setup.ask(actor, 2) == [], "the newest policy is counted in full"
 
 
+def test_each_policy_gets_its_first_trials_also_when_a_newer_one_is_there(
+    setup: EvaluatorSetup,
+) -> None:
+    setup.restart("--set", "evaluator.first_trials=2")
+    actor, other = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "b")
+    setup.publish(1)
+    assert setup.ask_until_given(actor, 1) == 70
+    setup.publish(2)
+    assert setup.ask_until_given(other, 2) == 70
+    assert setup.ask(other, 1) == [71], "the second first trial of the older policy"
+    assert setup.ask(actor, 1) == [], "it gets no more than two"
+    assert setup.ask(actor, 3) == []
+    setup.send(actor, 70, 1)
+    setup.send(other, 71, 1)
+    assert setup.ask(actor, 1) == []
+    metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 2})
+    assert metrics.leases == 1
+
+
 def test_nothing_counts_that_was_not_asked_for(setup: EvaluatorSetup) -> None:
     actor, stranger = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "s")
     setup.publish(1)

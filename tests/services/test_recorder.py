@@ -32,6 +32,8 @@ from services.monitoring.history import history_file, read_history
 MakeEpisode = Callable[..., Episode]
 
 RUN = "recorded"
+PLAYED_S = 1767323045.5
+"""2026-01-02 03:04:05.5 UTC."""
 
 
 @pytest.fixture
@@ -81,13 +83,14 @@ class Listener:
 
 @pytest.fixture
 def rollout(make_episode: MakeEpisode) -> Callable[..., Rollout]:
-    def make(name: str, trial: int | None = 0) -> Rollout:
+    def make(name: str, trial: int | None = 0, started_s: float | None = None) -> Rollout:
         episode = make_episode(
             20,
             id=name,
             actor="actor",
             config_digest=settings_digest(),
             kind=Kind.PRACTICE if trial is None else Kind.TRIAL,
+            started_s=started_s,
             outputs=np.full((20, 110), 0.1, dtype=np.float32),
         )
         return Rollout(episode=episode, run_id="training")
@@ -107,15 +110,17 @@ def test_every_rollout_is_kept_once(
         receipts: list[Receipt] = []
         bus.subscribe(bus.keys.receipt(Role.RECORDER, "actor"), receipts.append, Receipt)
         listener.wait_for(lambda metrics: metrics.episodes == 0)
-        sent = [rollout(f"rollout{number}", number or None) for number in range(5)]
+        sent = [rollout(f"rollout{n}", n or None, started_s=PLAYED_S - n / 1000) for n in range(5)]
         for message in [*sent, *sent[:2]]:
             bus.deliver(bus.keys.rollout("actor"), message)
         metrics = listener.wait_for(lambda metrics: metrics.episodes == 5)
         assert (metrics.dropped, metrics.refused, metrics.deleted) == (0, 0, 0)
         eventually(lambda: len(receipts) == 7, "a receipt each time")
         assert {receipt.episode for receipt in receipts} == {f"rollout{n}" for n in range(5)}
-        assert files(tmp_path) == [f"rollout{number}.mcap" for number in range(5)]
-        kept = read_episode(tmp_path / RUN / "rollouts" / "rollout3.mcap")
+        # The names sort by the time at which the episodes were played: the last one first here.
+        names = [f"20260102-030405-{500 - n:03d}_rollout{n}.mcap" for n in (4, 3, 2, 1, 0)]
+        assert files(tmp_path) == names
+        kept = read_episode(tmp_path / RUN / "rollouts" / names[1])
         assert np.array_equal(kept.images, sent[3].episode.images)
         assert kept.outcome == sent[3].episode.outcome
         assert stop(process) == 0

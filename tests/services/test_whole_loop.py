@@ -168,5 +168,5 @@ def test_nothing_is_lost_or_counted_twice_when_processes_are_killed(tmp_path: Pa
     assert set(each.values()) == {1}
     seeds = {trial["seed"] for trial in counted if trial["policy_version"] == VERSIONS}
     assert seeds == set(range(1000, 1000 + TRIALS))
-    recorded = {path.stem for path in (loop.folder / "rollouts").glob("*.mcap")}
+    recorded = {path.stem.rpartition("_")[2] for path in (loop.folder / "rollouts").glob("*.mcap")}
     assert {trial["episode"] for trial in counted} <= recorded

@@ -122,7 +122,9 @@ class Renderer:
         )
         rotation = np.empty(9)
         for box, code in zip(self._boxes, self._box_codes, strict=True):
-            row = poses.rows[poses.places[box.name]]
+            row = np.array([*box.pose.position_m, *box.pose.quaternion])
+            if box.name in poses.places:
+                row = poses.rows[poses.places[box.name]]
             mujoco.mju_quat2Mat(rotation, row[3:])
             geom = self._drawn.geoms[self._drawn.ngeom]
             half = np.array(box.size_m) / 2

@@ -68,6 +68,9 @@ class Renderer:
         if self._screen is not None:
             self._scene.remove_entity(self._screen.entity)
         self._boxes = {box.name: self._add([_box_shape(box)]) for box in scene.boxes}
+        for box in scene.boxes:
+            pose = sapien.Pose(box.pose.position_m, box.pose.quaternion)
+            self._boxes[box.name].set_pose(pose)
         self._screen = None if scene.screen is None else self._screen_of(scene.screen)
 
     def place(self, poses: Mapping[str, sapien.Pose], step: int) -> None:
@@ -75,7 +78,8 @@ class Renderer:
         for name, entity in self._robot.items():
             entity.set_pose(poses[name])
         for name, entity in self._boxes.items():
-            entity.set_pose(poses[name])
+            if name in poses:
+                entity.set_pose(poses[name])
         if self._screen is not None:
             self._screen.show(step)
 

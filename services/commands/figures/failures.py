@@ -10,11 +10,12 @@ from typing import Final
 from actors.tasks.registry import make_task
 from proto.errors import UserError
 from proto.recordings.episodes import read_episode
-from services.arguments.common import add_config, config_of
+from services.arguments.common import add_config, config_of, integer
 from services.figures import failures
 from services.figures.figure_result import FigureResult
 from services.trials.trial_log import CountedTrial, read_trials
 
+NEWEST: Final = "newest"
 SUMMARY: Final = "situations in which a policy fails, and its errors at the grasp"
 
 
@@ -32,16 +33,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rollouts", type=Path, nargs="+", default=[], metavar="DIR", help="folders of rollouts"
     )
-    parser.add_argument("--policy-version", type=int, help="only trials of this version")
+    parser.add_argument(
+        "--policy-version", type=_version, default=NEWEST, help="version whose trials are drawn"
+    )
 
 
 def draw(arguments: argparse.Namespace) -> FigureResult:
     """Read the trials of one policy and draw the situations in which it failed."""
-    found = [
-        trial
-        for trial in _counted_trials(arguments)
-        if arguments.policy_version in {None, trial.policy_version}
-    ]
+    counted = list(_counted_trials(arguments))
+    version = arguments.policy_version
+    if version == NEWEST:
+        version = max((trial.policy_version for trial in counted), default=0)
+    found = [trial for trial in counted if trial.policy_version == version]
     trials = failures.Trials.of(found, make_task(config_of(arguments).task))
     name, version = _only_policy(found)
     words = f"{name} version {version}" if version else name
@@ -67,5 +70,9 @@ def _only_policy(trials: list[CountedTrial]) -> tuple[str, int]:
     policies = sorted({(trial.run_id, trial.policy_version) for trial in trials})
     if len(policies) > 1:
         names = ", ".join(f"{name} version {version}" for name, version in policies)
-        raise UserError(f"these are trials of {names}; choose one with --policy-version")
+        raise UserError(f"these are trials of {names}; name files or folders of one training")
     return policies[0]
+
+
+def _version(text: str) -> int | str:
+    return text if text == NEWEST else integer(0)(text)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from proto.episode import Episode
 from proto.errors import UserError
 from proto.recordings.episodes import read_episode, write_episode
 from services.cli import main
-from services.figures.activity import UNITS_SHOWN, difference_by_phase, draw
+from services.figures.activity import SUBNETS, UNITS_SHOWN, difference_by_phase, draw
 from services.figures.rollouts import Activity, activity_of
 
 UNITS = {"mstnn_fast": 1188, "mstnn_slow": 336, "pfc": 20, "mtrnn_slow": 30, "mtrnn_fast": 50}
@@ -46,8 +47,12 @@ def test_one_command_draws_two_rollouts_and_prints_their_difference(
     assert {name: len(units) for name, units in numbers["units"].items()} == {
         "mstnn_fast": UNITS_SHOWN,
         "pfc": 20,
-        "mtrnn_fast": UNITS_SHOWN,
+        "mtrnn_slow": 30,
+        "mtrnn_fast": 50,
     }
+    per_map = UNITS["mstnn_fast"] // 3
+    maps = Counter(unit // per_map for unit in numbers["units"]["mstnn_fast"])
+    assert maps == dict.fromkeys(range(3), UNITS_SHOWN // 3), "as many of each map"
     first = numbers["rollouts"][0]
     assert first["situation"]["object_yaw_deg"] == 44
     assert [episode.phases[start] for start in first["phase_starts"]] == list(range(8))
@@ -103,12 +108,11 @@ def test_the_difference_of_rollouts_is_computed_for_each_phase(
     make_episode: Callable[..., Episode],
 ) -> None:
     episode = make_episode(6, phases=np.array([1, 1, 2, 2, 3, 3], np.uint8))
-    names = ("mstnn_fast", "pfc", "mtrnn_fast")
-    still = {name: np.zeros((6, 4), np.float32) for name in names}
-    moved = {name: np.zeros((6, 4), np.float32) for name in names}
+    still = {name: np.zeros((6, 4), np.float32) for name in SUBNETS}
+    moved = {name: np.zeros((6, 4), np.float32) for name in SUBNETS}
     moved["pfc"][2:4] = 0.5
     apart = difference_by_phase(Activity(episode, still), Activity(episode, moved))
-    assert apart == {"mstnn_fast": [0, 0, 0], "pfc": [0, 0.5, 0], "mtrnn_fast": [0, 0, 0]}
+    assert apart == {name: [0, 0.5 * (name == "pfc"), 0] for name in SUBNETS}
 
 
 def test_columns_say_what_differs_and_subtasks_have_names(
@@ -122,7 +126,7 @@ def test_columns_say_what_differs_and_subtasks_have_names(
         make_episode(6, phases=phases, phase_names=names, situation={**situation, **changed})
         for changed in ({}, {"indicated_x_m": "0.07", "indicated_y_m": 0.26})
     ]
-    states = {name: np.zeros((6, 4), np.float32) for name in ("mstnn_fast", "pfc", "mtrnn_fast")}
+    states = {name: np.zeros((6, 4), np.float32) for name in SUBNETS}
     figure = draw([Activity(episode, states) for episode in episodes])
     titles = [axes.get_title() for axes in figure.axes[:2]]
     assert titles == [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -107,16 +108,19 @@ def test_recorded_rollouts_can_be_drawn(
     assert "snapping" in capsys.readouterr().out
 
 
-def test_trials_of_several_versions_are_refused(
+def test_the_newest_of_several_versions_is_drawn_unless_another_is_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trials = [*play(nearest, 20), *play(nearest, 10, version=2)]
     path, out = write(tmp_path / "trials.jsonl", trials), tmp_path / "failures.png"
-    assert main(f"figure failures --outcomes {path} --out {out}".split()) == 2
-    assert "run version 1, run version 2" in capsys.readouterr().err
-    chosen = f"figure failures --outcomes {path} --out {out} --policy-version 2 --json"
-    assert main(chosen.split()) == 0
-    assert json.loads(capsys.readouterr().out)["trials"] == 10
+    command = f"figure failures --outcomes {path} --out {out} --json"
+    for more, drawn in (("", 10), ("--policy-version newest", 10), ("--policy-version 1", 20)):
+        assert main([*command.split(), *more.split()]) == 0
+        assert json.loads(capsys.readouterr().out)["trials"] == drawn
+    other = [replace(trial, run_id="other") for trial in play(nearest, 3, version=2)]
+    path = write(tmp_path / "trials.jsonl", [*trials, *other])
+    assert main(command.split()) == 2
+    assert "other version 2, run version 2" in capsys.readouterr().err
 
 
 def test_files_without_trials_are_refused(

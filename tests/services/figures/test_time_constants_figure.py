@@ -11,8 +11,9 @@ import pytest
 from learner.tutoring.store import TutoringStore
 from proto.config import Config, load_config
 from services.cli import main
+from services.figures import time_constants
 from services.trials import sweeps
-from services.trials.success import Rate, difference95
+from services.trials.success import Rate, Tally, difference95
 
 QUICK = (
     "--set learner.pretraining.epochs=1 --set learner.epochs=2 --set learner.warmup_epochs=1"
@@ -99,3 +100,11 @@ def test_the_interval_of_a_difference_is_that_of_newcombe() -> None:
     """The example of Newcombe's paper: 56 of 70 against 48 of 80."""
     low, high = difference95(Rate(56, 70), Rate(48, 80))
     assert (low, high) == (pytest.approx(0.0524, abs=1e-4), pytest.approx(0.3339, abs=1e-4))
+
+
+def test_the_published_rates_stand_beside_the_lenient_reading_only() -> None:
+    figure = time_constants.draw({30.0: {1: Tally(10)}}, {30.0: Rate(32, 52), 150.0: Rate(44, 52)})
+    named = {axes.get_title(): axes.get_legend_handles_labels()[1] for axes in figure.get_axes()}
+    assert any("paper" in label for label in named["lenient"])
+    for reading in ("strict", "precise"):
+        assert not any("paper" in label for label in named[reading])

@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+from proto.config import Config
 from proto.episode import Episode
 from proto.recordings.episodes import read_episode, write_episode
 from services.cli import main
+from services.playing.video import CAPTION_HEIGHT, _progress, write_video
 
 STEPS = (0, 60, 120)
 """Steps of an episode that the tests replay; rendering all would take long."""
@@ -47,25 +49,47 @@ def test_the_video_shows_both_views_of_every_step(short: Path, tmp_path: Path) -
     out = tmp_path / "videos" / "episode.mp4"
     assert main(["replay", str(short), "--out", str(out), "--fps", "5"]) == 0
     frames, fps = read_video(out)
-    assert len(frames) == len(STEPS)
+    assert len(frames) == len(STEPS) + 5, "the last frame stays for a second"
     assert fps == pytest.approx(5)
-    assert {frame.shape for frame in frames} == {(480, 1280, 3)}
+    assert {frame.shape for frame in frames} == {(480 + CAPTION_HEIGHT, 1280, 3)}
+    for held in frames[len(STEPS) :]:
+        assert cv2.absdiff(held, frames[len(STEPS) - 1]).mean() < 1
+    frames = frames[: len(STEPS)]
     assert list(out.parent.iterdir()) == [out]
     for frame in frames:
-        outside, eye = frame[150:, :640].astype(int), frame[150:, 640:].astype(int)
+        outside, eye = frame[:480, :640].astype(int), frame[:480, 640:].astype(int)
         for view in (outside, eye):
             assert view.std() > 20, "something is to be seen"
         red = (outside[..., 2] - outside[..., :2].max(axis=2)) > 60
         assert red.any(), "the object, or the robot's cover"
     for before, after in pairwise(frames):
-        moved = cv2.absdiff(before, after)[150:]
+        moved = cv2.absdiff(before, after)[:480]
         assert (moved > 50).any(axis=2)[:, :640].sum() > 500
         assert (moved > 50).any(axis=2)[:, 640:].sum() > 500
 
 
+def test_the_outcome_is_told_in_the_last_step_only(recordings: Path) -> None:
+    episode = read_episode(recordings / "case03_repeat00.mcap")
+    texts = [_progress(episode, step) for step in range(episode.steps)]
+    assert [n for n, text in enumerate(texts) if "utcome" in text] == [episode.steps - 1]
+    assert "Outcome: precise" in texts[-1]
+    assert texts[0] == f"step 1 of {episode.steps}: {episode.phase_names[0]}"
+
+
+def test_several_episodes_follow_each_other(recordings: Path, tmp_path: Path) -> None:
+    both = [
+        steps_of(read_episode(recordings / f"case{case}_repeat00.mcap"), [0])
+        for case in ("03", "41")
+    ]
+    write_video(both, tmp_path / "both.gif", Config(), fps=2)
+    frames, _ = read_video(tmp_path / "both.gif")
+    assert len(frames) == 2 * (1 + 2)
+    assert cv2.absdiff(frames[0], frames[-1]).mean() > 1
+
+
 def test_recordings_are_exported_as_videos(short: Path, tmp_path: Path) -> None:
     assert main(["export", str(short.parent), "--format", "video", "--out", str(tmp_path)]) == 0
-    assert len(read_video(tmp_path / f"{read_episode(short).id}.mp4")[0]) == len(STEPS)
+    assert len(read_video(tmp_path / f"{read_episode(short).id}.mp4")[0]) == len(STEPS) + 10
 
 
 def test_the_recorded_picture_agrees_with_the_rendered_view(short: Path, tmp_path: Path) -> None:
@@ -75,11 +99,11 @@ def test_the_recorded_picture_agrees_with_the_rendered_view(short: Path, tmp_pat
     frames, fps = read_video(out)
     episode = read_episode(short)
     assert fps == pytest.approx(1 / episode.control_period_s)
-    inset = cv2.cvtColor(frames[0], cv2.COLOR_BGR2GRAY)[-145:-1, -193:-1]
+    inset = cv2.cvtColor(frames[0], cv2.COLOR_BGR2GRAY)[:480][-145:-1, -193:-1]
     shown = cv2.resize(inset, (64, 48), interpolation=cv2.INTER_AREA)
     assert np.abs(shown.astype(int) - episode.images[0]).mean() < 6
     # at step 0 the focus is wide: the crop is the whole view
-    view = cv2.cvtColor(frames[0], cv2.COLOR_BGR2GRAY)[:, 640:]
+    view = cv2.cvtColor(frames[0], cv2.COLOR_BGR2GRAY)[:480, 640:]
     small = cv2.resize(view, (64, 48), interpolation=cv2.INTER_AREA)[5:30, :40]
     assert np.abs(small.astype(int) - episode.images[0][5:30, :40]).mean() < 12
 
@@ -93,7 +117,7 @@ def test_a_recovered_episode_can_be_replayed(recordings: Path, tmp_path: Path) -
     recovered = read_episode(path, partial=True)
     write_episode(path, steps_of(recovered, [recovered.steps - 1]))
     assert main(["replay", str(path), "--out", str(out)]) == 0
-    assert len(read_video(out)[0]) == 1
+    assert len(read_video(out)[0]) == 1 + 10
 
 
 OWN_BACKEND = """
@@ -121,7 +145,7 @@ def test_an_episode_of_a_users_backend_is_replayed_with_it(
     write_episode(Path("short.mcap"), steps_of(episode, [60]))
     assert main(["replay", "short.mcap", "--out", "own.mp4"]) == 0
     frame = read_video(Path("own.mp4"))[0][0]
-    outside, eye = frame[150:, :640], frame[150:, 640:]
+    outside, eye = frame[:480, :640], frame[:480, 640:]
     assert outside.mean(axis=(0, 1)) == pytest.approx((255, 0, 0), abs=10), "blue green red"
     assert eye.std() > 20, "something is to be seen"
 
