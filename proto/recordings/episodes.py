@@ -29,7 +29,7 @@ from typing import Any, Final, NamedTuple
 import cv2
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.records import Channel, Metadata
+from mcap.records import Channel, Header, Metadata
 from mcap.records import Message as McapMessage
 from mcap.writer import Writer
 from numpy.typing import NDArray
@@ -256,6 +256,67 @@ def read_summary(path: Path) -> EpisodeSummary:
         )
     except _BROKEN as error:
         raise _not_an_episode(path, error) from error
+
+
+@dataclass(frozen=True)
+class EpisodeHeading:
+    """What the beginning of a recording says of the episode; see `Episode`.
+
+    Attributes:
+        steps: number of control steps that were played.
+    """
+
+    id: str
+    kind: Kind
+    task: str
+    situation: Situation
+    seed: int
+    actor: str
+    backend: str
+    policy: str
+    policy_version: int
+    conditions: Conditions | None
+    outcome: Outcome
+    started_s: float | None
+    steps: int
+
+
+def read_heading(path: Path) -> EpisodeHeading:
+    """Read what a recording says of its episode; only the beginning of the file is read.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    metadata: dict[str, dict[str, str]] = {}
+    try:
+        with path.open("rb") as stream:
+            beginning = stream.read(_BEGINNING_BYTES)
+        for record in whole_records(beginning):
+            if isinstance(record, Metadata):
+                metadata[record.name] = record.metadata
+            elif not isinstance(record, Header):
+                break
+        texts = metadata["episode"]
+        return EpisodeHeading(
+            id=texts["id"],
+            kind=Kind(texts["kind"]),
+            task=texts["task"],
+            situation={k: json.loads(v) for k, v in metadata["situation"].items()},
+            seed=int(texts["seed"]),
+            actor=texts["actor"],
+            backend=texts["backend"],
+            policy=texts["policy"],
+            policy_version=int(texts["policy_version"]),
+            conditions=_conditions(texts),
+            outcome=_outcome(metadata),
+            started_s=_started_s(texts),
+            steps=int(texts["steps"]),
+        )
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except (DamageError, *_BROKEN) as error:
+        problem = plain(error, 200)
+        raise UserError(f"{path} is damaged, or no recording of an episode ({problem})") from error
 
 
 def read_kind(path: Path) -> Kind:
