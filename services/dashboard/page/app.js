@@ -130,9 +130,9 @@ if ("WebSocket" in window) connect();
 else showBanner("This browser has no WebSocket, so nothing can be shown live. Any browser since 2012 has it; "
   + "in a terminal, vmdnn watch shows the run.");
 
-let resizing = 0;
-addEventListener("resize", () => {
-  cancelAnimationFrame(resizing);
-  resizing = requestAnimationFrame(redrawAll);
+const drawn = { success, loss, map, plane, joints: player };
+const sizes = new ResizeObserver((changes) => {
+  for (const { target } of changes) requestAnimationFrame(() => drawn[target.id].redraw());
 });
+for (const id of Object.keys(drawn)) sizes.observe(byId(id));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redrawAll);

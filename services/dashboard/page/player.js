@@ -206,10 +206,15 @@ export class Player {
     const { outcome, situation } = this.episode;
     const rows = (pairs) => make("dl", {}, ...pairs.flatMap(([name, value]) => [make("dt", {}, name), make("dd", {}, value)]));
     const reading = ["precise", "strict", "lenient"].find((name) => outcome[name]) ?? "failed";
-    const measures = Object.entries(outcome.measures).map(([name, [value, unit]]) => [name.replaceAll("_", " "), `${+value.toPrecision(3)} ${unit}`.trim()]);
+    const measures = Object.entries(outcome.measures).map(([name, [value, unit]]) => [wordsAndUnit(name)[0], measureText(value, unit)]);
     byId("facts").replaceChildren(
       make("h3", {}, `outcome: ${reading}`), rows(measures),
       make("h3", {}, "situation"), rows(Object.entries(situation).map(([name, value]) => [wordsAndUnit(name)[0], valueText(name, value)])));
     byId("facts").setAttribute("aria-label", situationText(situation));
   }
+}
+
+function measureText(value, unit) {
+  if (unit === "step") return value < 0 ? "never" : `step ${value}`;
+  return `${Math.abs(value) < 0.005 ? 0 : +value.toPrecision(3)} ${unit}`.trim();
 }
