@@ -30,7 +30,7 @@ from proto.security import certificate_for
 from services.arguments.common import config_argument, integer
 from services.arguments.process import PRIVATE
 from services.board import Board, RunView
-from services.dashboard.ports import listening_socket
+from services.dashboard.ports import listening_socket, page_address
 from services.machine.ports import port_trouble
 from services.terminal.display import display
 from services.terminal.run_words import success_words
@@ -144,11 +144,17 @@ def run(config: Config, actors: Mapping[str, int], console: Console) -> None:
         ProcessFailedError: a process can never work.
         SupervisorEndedError: supervisord was killed.
     """
+    dashboard = dashboard_place(config)
     with owned_run(config.run_folder):  # nothing of the run is touched before
-        _run(config, actors, console)
+        _run(config, actors, dashboard, console)
 
 
-def _run(config: Config, actors: Mapping[str, int], console: Console) -> None:
+def _run(
+    config: Config,
+    actors: Mapping[str, int],
+    dashboard: tuple[str, int] | None,
+    console: Console,
+) -> None:
     started_s = time.monotonic()
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
@@ -164,11 +170,8 @@ def _run(config: Config, actors: Mapping[str, int], console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    dashboard = dashboard_place(config)
     if dashboard is not None:
-        host, port = dashboard
-        page = f"watch it at http://{f'[{host}]' if ':' in host else host}:{port}"
-        console.print(page, highlight=False, soft_wrap=True)
+        console.print(f"watch it at {page_address(*dashboard)}", highlight=False, soft_wrap=True)
     started = programs(config, file, actors)
     if dashboard is not None:
         started.append(dashboard_program(file, *dashboard))

@@ -6,17 +6,20 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
-from learner.network_policy import NetworkPolicy
-from proto.episode import Floats, Kind
+from learner.checkpoint import NETWORK_PREFIX, load_checkpoint
+from learner.network.numpy_network import NumpyNetwork
+from learner.network.subnets import Parameters
+from learner.network.vision_input import vision_input
+from proto.episode import Floats, Image, Kind
 from proto.errors import UserError
 from proto.plain_text import plain
 from proto.recordings.episodes import read_episode
 from services.archive import Recording, RunArchive
-from services.figures.components import Components
+from services.figures.components import Array, Components
 
 LOG = logging.getLogger(__name__)
 
@@ -100,12 +103,16 @@ class PlaneMaker:
 
 
 def _plane(policy_file: Path, recordings: Sequence[Recording]) -> Plane:
-    policy = NetworkPolicy.from_file(policy_file)
+    checkpoint = load_checkpoint(policy_file)
+    # In numpy: the compiled network would need torch in this process.
+    network = NumpyNetwork(
+        checkpoint.metadata.network, cast("Parameters", checkpoint.part(NETWORK_PREFIX))
+    )
     episodes = [read_episode(each.path) for each in recordings]
-    states = [policy.states(episode.images)["pfc"].astype(np.float64) for episode in episodes]
+    states = [_states(network, episode.images) for episode in episodes]
     components = Components.of(np.concatenate(states))
     return Plane(
-        version=policy.version,
+        version=checkpoint.metadata.version,
         components=components,
         phase_names=episodes[0].phase_names,
         paths=[
@@ -113,3 +120,13 @@ def _plane(policy_file: Path, recordings: Sequence[Recording]) -> Plane:
             for each, episode in zip(states, episodes, strict=True)
         ],
     )
+
+
+def _states(network: NumpyNetwork, images: Image) -> Array:
+    """Activity (T, units) of the PFC of a network that sees images (T, 48, 64)."""
+    network.reset()
+    states = []
+    for image in images:
+        network.step(vision_input(image))
+        states.append(network.pfc())
+    return np.stack(states).astype(np.float64)

@@ -47,6 +47,13 @@ def listening_socket(host: str, port: int, *, or_another: bool = False) -> socke
 def address_of(listening: socket.socket) -> str:
     """The address of the page that a socket serves, such as `http://127.0.0.1:8080`."""
     host, port = listening.getsockname()[:2]
+    return page_address(host, port)
+
+
+def page_address(host: str, port: int) -> str:
+    """The address of a page; for all addresses of this machine, with the machine's name."""
+    if host in ("0.0.0.0", "::"):
+        host = socket.gethostname()
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 

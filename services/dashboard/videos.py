@@ -48,6 +48,7 @@ class Videos:
         self._config = config
         self._folder = tempfile.TemporaryDirectory(prefix="vmdnn-videos-")
         self._lock = threading.Lock()
+        self._begun = 0
         self._videos: OrderedDict[str, _Video] = OrderedDict()
         self._context = multiprocessing.get_context("spawn")
         self._frames: Synchronized[int] = self._context.Value("i", 0)
@@ -63,8 +64,10 @@ class Videos:
     def close(self) -> None:
         """Stop rendering and delete all videos."""
         self._ended.set()  # the video that is rendered now ends with its next frame
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+        with self._lock:
+            pool, self._pool = self._pool, None
+        if pool is not None:
+            pool.shutdown(wait=True, cancel_futures=True)
         self._folder.cleanup()
 
     def ask(self, episode: str, recording: Path) -> Mapping[str, Any]:
@@ -95,18 +98,29 @@ class Videos:
             return video.path if video is not None and _is_ready(video) else None
 
     def _begin(self, episode: str, recording: Path) -> _Video:
-        out = Path(self._folder.name) / f"{episode}.mp4"
+        self._begun += 1
+        out = Path(self._folder.name) / f"{self._begun}.mp4"
         if self._pool is None:
             self._pool = ProcessPoolExecutor(
                 1, self._context, _begin_worker, (self._frames, self._ended)
             )
         rendering = self._pool.submit(_render, recording, out, self._config)
         self._videos[episode] = _Video(out, rendering)
+        # In a thread of its own, because the pool may hold its lock when it calls back.
+        rest = threading.Thread(target=self._rest, daemon=True)
+        rendering.add_done_callback(lambda _: rest.start())
         for name in [name for name, each in self._videos.items() if each.rendering.done()]:
             if len(self._videos) <= KEPT:
                 break
             self._videos.pop(name).path.unlink(missing_ok=True)
         return self._videos[episode]
+
+    def _rest(self) -> None:
+        """End the process if nothing is left to render: a simulator takes much memory."""
+        with self._lock:
+            if self._pool is not None and all(e.rendering.done() for e in self._videos.values()):
+                self._pool.shutdown(wait=False)
+                self._pool = None
 
     def _state_of(self, video: _Video, episode: str) -> Mapping[str, Any]:
         if _is_ready(video):
@@ -129,9 +143,6 @@ class Videos:
         if isinstance(error, UserError):
             return plain(error, 500)
         LOG.error("a video could not be rendered: %r", error)
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
-            self._pool = None  # its process may be dead
         return "the video could not be rendered; the log of the dashboard says why"
 
 

@@ -122,6 +122,7 @@ def test_the_page_shows_what_happens(
     assert staged.commands
 
 
+@pytest.mark.slow
 def test_the_page_fits_a_phone_and_the_night(
     browser: Browser, staged: StagedRun, episodes: list[Episode]
 ) -> None:

@@ -163,7 +163,7 @@ def test_a_browser_that_takes_nothing_holds_up_nobody(staged: StagedRun) -> None
     ):
         browser = Browser(connection)
         with every(0.1, tell):
-            for _ in range(6):  # each is more than all buffers of a connection hold
+            for _ in range(3):  # each is more than all buffers of a connection hold
                 before = newest()
                 browser.hear(lambda before=before: newest() > max(before, 1000))
         assert slow.recv(timeout=PATIENCE_S), "it is told when it takes something"
