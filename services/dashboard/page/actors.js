@@ -68,6 +68,10 @@ export class Actors {
     const wanted = new Set([...this.present.slice(0, SHOWN_AT_FIRST),
       ...this.present.filter((id) => this.added.has(id))].slice(0, MOST_SHOWN));
     for (const id of wanted) if (!this.cards.has(id)) this.cards.set(id, this.makeCard(id));
+    const sorted = [...this.cards.keys()].sort();
+    if (sorted.some((id, at) => byId("actors").children[at] !== this.cards.get(id).root)) {
+      byId("actors").append(...sorted.map((id) => this.cards.get(id).root));
+    }
     const hidden = this.present.filter((id) => !wanted.has(id));
     byId("actor-choice").hidden = hidden.length === 0;
     setOptions(byId("actor-select"), [["", `one of ${hidden.length} more`], ...hidden.map((id) => [id, id])]);
@@ -106,7 +110,6 @@ export class Actors {
       make("div", { class: "head" }, title, tag, film),
       make("div", { class: "eye" }, seen, make("div", { class: "below" }, whole, make("div", {}, part, speed))),
       make("div", {}, phase, ticks, rows));
-    byId("actors").append(root);
     return { root, seen, frame, whole, part, title, tag, speed, film, phase, ticks, rows, bars: null, outside: null };
   }
 
