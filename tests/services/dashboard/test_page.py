@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
-from processes import eventually, vmdnn
+from processes import eventually, stop, vmdnn
 from run_metrics import ACTOR
 from staged_run import StagedRun, Told, dashboard
 
@@ -20,7 +20,7 @@ from actors.tasks.registry import make_task
 from proto.config import Config
 from proto.episode import NO_FAILURE, Episode, Kind
 from proto.periodic import every
-from proto.recordings.episodes import read_episode, write_episode
+from proto.recordings.episodes import write_episode
 from services.playing.workers import Job, play_all
 
 CHROMIUM = shutil.which("chromium")
@@ -170,25 +170,29 @@ def test_a_browser_without_websocket_is_told(browser: Browser, staged: StagedRun
         expect(page.locator("#banner")).to_contain_text("no WebSocket")
 
 
+@pytest.fixture(scope="module")
+def failure(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The beginning of a real failure: the object lies across, and the policy does not know."""
+    config = Config()
+    situation = {**make_task(config.task).tutored()[0], "object_yaw_deg": 44.0}
+    file = tmp_path_factory.mktemp("failure") / "failure.mcap"
+    job = Job(situation, 1, Kind.PRACTICE, record_to=file)
+    ((_, episode),) = play_all(config, "yaw-blind", [job], workers=1)
+    assert episode.outcome.reason != NO_FAILURE
+    names = ("images", "actions", "targets", "joints_deg", "phases", "body_poses")
+    kept = {name: getattr(episode, name)[:20] for name in names}
+    view = episode.view and replace(episode.view, focal_px=episode.view.focal_px[:20])
+    write_episode(file, replace(episode, view=view, **kept))
+    return file
+
+
 @pytest.mark.slow  # renders with SAPIEN
-def test_the_video_of_a_failure_plays(browser: Browser, staged: StagedRun) -> None:
-    """A real failure: the object lies across, and the policy thinks it lies straight."""
-    config: Config = staged.config
-    task = make_task(config.task)
-    rollouts = config.run_folder / "rollouts"
+def test_the_video_of_a_failure_plays(browser: Browser, staged: StagedRun, failure: Path) -> None:
+    rollouts = staged.config.run_folder / "rollouts"
     for recording in rollouts.iterdir():
         recording.unlink()
-    situation = {**task.tutored()[0], "object_yaw_deg": 44.0}
-    ((_, episode),) = play_all(
-        config,
-        "yaw-blind",
-        [Job(situation, 1, Kind.PRACTICE, record_to=rollouts / "failure.mcap")],
-        workers=1,
-    )
-    assert episode.outcome.reason != NO_FAILURE
-    short = _first_steps(read_episode(rollouts / "failure.mcap"), 20)
-    write_episode(rollouts / "failure.mcap", short)
-    with dashboard(config) as address, opened(browser, address, WIDE, "light") as page:
+    shutil.copy(failure, rollouts)
+    with dashboard(staged.config) as address, opened(browser, address, WIDE, "light") as page:
         page.select_option("#filter-outcome", "failed")
         page.locator("#rollouts tbody tr").click()
         video = page.locator("#video")
@@ -203,21 +207,14 @@ def test_the_video_of_a_failure_plays(browser: Browser, staged: StagedRun) -> No
         assert video.evaluate("video => video.currentTime") == pytest.approx(0.45, abs=0.01)
 
 
-def _first_steps(episode: Episode, steps: int) -> Episode:
-    names = ("images", "actions", "targets", "joints_deg", "phases", "body_poses")
-    kept = {name: getattr(episode, name)[:steps] for name in names}
-    view = episode.view and replace(episode.view, focal_px=episode.view.focal_px[:steps])
-    return replace(episode, view=view, outputs=None, **kept)
-
-
 @pytest.mark.slow  # renders with SAPIEN
-def test_replay_shows_one_recording(browser: Browser, tmp_path: Path, recordings: Path) -> None:
+def test_replay_shows_one_recording(browser: Browser, tmp_path: Path, failure: Path) -> None:
     log = tmp_path / "replay.log"
-    file = recordings / "case03_repeat00.mcap"
-    with vmdnn("replay", file, "--open", "--set", "dashboard.port=0", log=log):
-        eventually(lambda: "http://" in log.read_text(), "its address")
-        address = log.read_text().split()[-3]
+    with vmdnn("replay", failure, "--open", "--set", "dashboard.port=0", log=log) as process:
+        eventually(lambda: "(Ctrl-C ends)" in log.read_text(), "its address")
+        (address,) = re.findall(r"http://\S+", log.read_text())
         with opened(browser, address, WIDE, "light") as page:
-            expect(page.locator("#player-title")).to_contain_text("tutoring of tutor")
+            expect(page.locator("#player-title")).to_contain_text("practice of yaw-blind")
             expect(page.locator("#live")).to_be_hidden()
             expect(page.locator("#video")).to_be_visible(timeout=4 * PATIENCE_MS)
+        assert stop(process) == 0

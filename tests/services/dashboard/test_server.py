@@ -22,6 +22,7 @@ from websockets.sync.client import ClientConnection, connect
 from proto.episode import Episode
 from proto.messages import Command
 from proto.periodic import every
+from services.cli import main
 
 
 class Browser:
@@ -204,3 +205,9 @@ def test_a_run_without_a_hub_shows_its_recordings(tmp_path: Path, staged: Staged
         browser = Browser(connection)
         browser.hear(lambda: len(browser.episodes) == 3)
         assert browser.newest["run"]["connected"] is False
+
+
+def test_replay_needs_something_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["replay", "episode.mcap"])
+    assert "--open" in capsys.readouterr().err
