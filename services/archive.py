@@ -16,12 +16,14 @@ from learner.checkpoint import load_checkpoint
 from proto.errors import UserError
 from proto.plain_text import plain
 from proto.recordings.episodes import EpisodeHeading, read_heading
+from proto.senders import is_id
 
 LOG = logging.getLogger(__name__)
 
 RECORDINGS_KEPT: Final = 20_000
 """An archive knows so many recordings; it forgets the oldest."""
 FOLDERS: Final = ("tutoring", "rollouts")
+POLICIES_SHOWN: Final = 200
 LOGS_SHOWN: Final = 64
 LINES_SHOWN: Final = 12
 LINE_LETTERS: Final = 400
@@ -99,26 +101,17 @@ class RunArchive:
 
     def look(self) -> None:
         """Find new recordings, the oldest first; each call reads a limited number of them."""
-        files: list[tuple[int, Path]] = []
-        for name in FOLDERS:
-            try:
-                with os.scandir(self.folder / name) as entries:
-                    files += [
-                        (entry.stat().st_mtime_ns, path)
-                        for entry in entries
-                        if entry.name.endswith(".mcap")
-                        and (path := Path(entry.path)) not in self._known
-                    ]
-            except OSError:  # there is no such folder yet, or a file has just been deleted
-                continue
-        for _, path in sorted(files)[:_READ_AT_ONCE]:
+        present = {path for name in FOLDERS for path in (self.folder / name).glob("*.mcap")}
+        self._known &= present
+        for path in sorted(present - self._known, key=_written_at_ns)[:_READ_AT_ONCE]:
             self._known.add(path)
             try:
                 heading = read_heading(path)
             except UserError as error:
                 LOG.warning("is not shown: %s", plain(error, 300))
                 continue
-            self._add(path, heading)
+            if is_id(heading.id):
+                self._add(path, heading)
 
     def since(self, number: int) -> Sequence[Recording]:
         """The recordings with a larger number, in the order of their numbers."""
@@ -142,9 +135,10 @@ class RunArchive:
 
     def policy_losses(self) -> Sequence[tuple[int, int, float]]:
         """Version, epoch and loss of each policy, the oldest first."""
-        for path in sorted((self.folder / "policies").glob("*.safetensors")):
-            if path not in self._losses:
-                self._losses[path] = _loss_of(path)
+        files = sorted((self.folder / "policies").glob("*.safetensors"))[-POLICIES_SHOWN:]
+        known, self._losses = self._losses, {}
+        for path in files:
+            self._losses[path] = known[path] if path in known else _loss_of(path)
         return [told for told in self._losses.values() if told is not None]
 
     def logs(self) -> Mapping[str, Sequence[str]]:
@@ -170,6 +164,13 @@ class RunArchive:
                 self._paths.pop(self._recordings[0].heading.id, None)
             self._recordings.append(Recording(self._found, path, heading))
             self._paths[heading.id] = path
+
+
+def _written_at_ns(path: Path) -> int:
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:  # it has just been deleted
+        return 0
 
 
 def _loss_of(policy: Path) -> tuple[int, int, float] | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -201,16 +202,16 @@ def outcome_content(outcome: Outcome) -> Mapping[str, Any]:
         "precise": outcome.precise,
         "reason": outcome.reason,
         "measures": {
-            plain(name, 64): [_short(measure.value), measure.unit]
+            plain(name, 64): [_short(measure.value), plain(measure.unit, 16)]
             for name, measure in outcome.measures.items()
         },
     }
 
 
 def situation_content(situation: Situation) -> Mapping[str, Any]:
-    """The values of a situation by name."""
+    """The values of a situation by name; those of a damaged recording may be anything."""
     return {
-        plain(name, 100): plain(value, 100) if isinstance(value, str) else _short(value)
+        plain(name, 100): _short(value) if isinstance(value, int | float) else plain(value, 100)
         for name, value in situation.items()
     }
 
@@ -335,7 +336,7 @@ def _score(score: PolicyScore) -> Mapping[str, Any]:
     }
 
 
-def _success(success: Success) -> list[float]:
+def _success(success: Success) -> list[float | None]:
     return [_short(success.rate), *map(_short, success.wilson95)]
 
 
@@ -349,15 +350,14 @@ def _episode(recording: Recording) -> Mapping[str, Any]:
         "policy": plain(heading.policy, 100),
         "version": heading.policy_version,
         "backend": plain(heading.backend, 100),
-        "suite": suite_of(heading.conditions),
-        "disturbance": "" if heading.conditions is None else heading.conditions.disturbance,
+        "suite": plain(suite_of(heading.conditions), 64),
         "seed": heading.seed,
         "actor": plain(heading.actor, 64),
         "situation": situation_content(heading.situation),
         "reached": reached,
         "reason": "" if outcome.reason == NO_FAILURE else plain(outcome.reason, 64),
         "steps": heading.steps,
-        "started_s": heading.started_s,
+        "started_s": None if heading.started_s is None else _finite(heading.started_s),
     }
 
 
@@ -369,6 +369,10 @@ def _jpeg(picture: Image) -> str:
     return base64.b64encode(data.tobytes()).decode()
 
 
-def _short(value: float) -> float:
-    """A number with as many digits as are shown."""
-    return float(f"{value:.5g}")
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _short(value: float) -> float | None:
+    """A number with as many digits as are shown; None if it is not finite."""
+    return float(f"{value:.5g}") if math.isfinite(value) else None

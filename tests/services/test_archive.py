@@ -30,6 +30,7 @@ def test_recordings_are_found_in_their_order(
     recorded(tmp_path / "rollouts", make_episode(3, id="second"), 200)
     recorded(tmp_path / "tutoring", make_episode(3, id="first"), 100)
     (tmp_path / "rollouts" / "broken.mcap").write_bytes(b"nothing")
+    write_episode(tmp_path / "rollouts" / "id.mcap", make_episode(3, id="../escape"))
     (tmp_path / "rollouts" / "unfinished.mcap.1234.part").write_bytes(b"nothing")
     archive.look()
     assert [each.heading.id for each in archive.since(0)] == ["first", "second"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import socket
 import time
 import urllib.error
@@ -19,9 +20,10 @@ from staged_run import StagedRun, Told, dashboard
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from proto.episode import Episode
+from proto.episode import Episode, Measure, Outcome
 from proto.messages import Command
 from proto.periodic import every
+from proto.recordings.episodes import write_episode
 from services.cli import main
 
 
@@ -194,6 +196,25 @@ def test_a_recording_is_told_step_by_step(staged: StagedRun, episodes: list[Epis
         status, body, _ = get(f"{address}/episodes/failed")
         assert status == 404
         assert "recorder.keep" in json.loads(body)["detail"]
+
+
+def test_what_is_wrong_in_a_recording_keeps_nobody_from_the_others(
+    staged: StagedRun, make_episode: Callable[..., Episode]
+) -> None:
+    measures = {"moved_mm": Measure(math.nan, "mm")}
+    odd = make_episode(
+        3,
+        id="odd",
+        situation={"object_y_m": math.inf, "other": ["<b>"]},
+        outcome=Outcome(False, False, False, "<i>", measures),
+    )
+    write_episode(staged.config.run_folder / "rollouts" / "odd.mcap", odd)
+    with dashboard(staged.config) as address, browsing(address) as connection:
+        browser = Browser(connection)
+        browser.hear(lambda: len(browser.episodes) == 4)
+        (told,) = (each for each in browser.episodes if each["id"] == "odd")
+        assert told["situation"] == {"object_y_m": None, "other": "['<b>']"}
+        assert json.loads(get(f"{address}/episodes/odd")[1])["outcome"]["reason"] == "<i>"
 
 
 def test_a_run_without_a_hub_shows_its_recordings(tmp_path: Path, staged: StagedRun) -> None:
