@@ -74,6 +74,8 @@ class StagedRun:
             image=episode.images[step],
             joints_deg=episode.joints_deg[step],
             action=episode.actions[step],
+            body_poses=episode.body_poses[step],
+            focal_px=np.array([50.0, 60.0], np.float32),
         )
         bus.publish(bus.keys.live(bus.id), live)
         if bus.watched(bus.keys.pictures(bus.id)):

@@ -156,6 +156,8 @@ def step(number: int, focus: float = 3.0) -> Live:
         image=np.full((48, 64), number, np.uint8),
         joints_deg=np.zeros(18, np.float32),
         action=np.array([0.0] * 10 + [focus], np.float32),
+        body_poses=np.zeros((1, 7), np.float32),
+        focal_px=np.array([50.0, 60.0], np.float32),
     )
 
 
