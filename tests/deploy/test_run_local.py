@@ -49,7 +49,8 @@ def started(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     """The smoke run in a folder, in a process group of its own as a terminal would give it."""
     command = (
         str(ROOT / "deploy" / "run_local.sh"), "--config", str(SMOKE), "--actors", "1",
-        "--set", f"run.folder={folder}", "--set", f"hub.endpoint={free_endpoint()}", *arguments,
+        "--set", f"run.folder={folder}", "--set", f"hub.endpoint={free_endpoint()}",
+        "--set", "dashboard.enabled=false", *arguments,
     )  # fmt: skip
     with subprocess.Popen(
         command,
@@ -68,7 +69,7 @@ def started(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 @pytest.mark.timeout(500)  # more than its own limits together
 def test_a_stopped_run_is_continued_to_its_end(tmp_path: Path) -> None:
     run = tmp_path / "smoke"
-    with started(tmp_path) as process:
+    with started(tmp_path, "--set", "dashboard.enabled=true") as process:
         eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept")
         os.killpg(process.pid, signal.SIGINT)  # Ctrl-C
         output, errors = process.communicate(timeout=60)
