@@ -15,6 +15,8 @@ from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
+from proto.permissions import Holder
+from proto.security import certificate_for
 from services.arguments.common import add_connection, config_of, integer, start_logging
 from services.arguments.process import TRY_AGAIN_S, heartbeat, is_supervised
 from services.board import Board
@@ -57,6 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = config_of(arguments)
     host = arguments.host or config.dashboard.host
     access = Access.of(host, allow_control=arguments.allow_control)
+    certificate_for(config.hub, Holder.WATCHER)  # so that what is wrong with it is told now
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
     with heartbeat(lifecycle):
