@@ -24,7 +24,7 @@ from actors.policies.contract import Policy
 from actors.policies.guided import GuidedPolicy
 from actors.policies.planned import make_tutor
 from actors.receipts import Receipts
-from actors.simulator import make_simulator, player_of
+from actors.simulator import Crop, make_simulator, player_of
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from actors.view import focal_lengths, view_of
@@ -42,12 +42,15 @@ from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.membership import membership
 from proto.messages import (
+    EYE_SIZE,
     LIVE_SCENE_EVERY,
+    OUTSIDE_SIZE,
     Correction,
     EpisodeFailed,
     EpisodeOutcome,
     Live,
     LiveScene,
+    Pictures,
     PolicyVersion,
     Rollout,
     Sequence,
@@ -81,6 +84,8 @@ UNSERVED_S: Final = 30.0
 """How often to say that the run has neither a learner nor an evaluator."""
 COMPARE_AGAIN_S: Final = 5.0
 """How long to wait before the settings are compared again, if they differ."""
+PICTURES_PERIOD_S: Final = 1.0
+"""Least time between two pictures for viewers: to render them takes longer than a control step."""
 PRACTICE_LIMIT: Final = 8
 """An actor does not practise when so many rollouts are without a receipt."""
 
@@ -142,6 +147,7 @@ def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
         body_poses=live.bodies.rows.astype(np.float32),
         focal_px=focal_lengths(live.crop),
         scene=_live_scene(live) if live.step % LIVE_SCENE_EVERY == 0 else None,
+        pfc=live.pfc,
     )
 
 
@@ -242,6 +248,8 @@ class Actor:
         self._failed = 0
         self._refused_policies = 0
         self._last: Episode | None = None
+        self._pictures_at_s = 0.0
+        self._can_render = config.simulator.render
 
     def run(self) -> None:
         """Play until it should stop; the episode that is played then is given up.
@@ -550,6 +558,7 @@ class Actor:
             if self._config.actor.live and self._bus.watched(live_key):
                 message = live_message(self._bus.id, assignment, live)
                 self._bus.publish(live_key, message, check=False)
+                self._publish_pictures(live.step)
 
         try:
             with self._reported_if_killed(assignment):
@@ -575,6 +584,23 @@ class Actor:
                 raise
             raise _SimulationError(problem) from error
         return replace(episode, training=assignment.training)
+
+    def _publish_pictures(self, step: int) -> None:
+        """Publish what the scene looks like now, if anyone wants to see it and it is due."""
+        key, now_s = self._bus.keys.pictures(self._bus.id), time.monotonic()
+        if not self._can_render or now_s < self._pictures_at_s or not self._bus.watched(key):
+            return
+        outside_height, outside_width, _ = OUTSIDE_SIZE
+        eye_height, eye_width, _ = EYE_SIZE
+        try:
+            outside = self._simulator.outside_picture(outside_width, outside_height)
+            eye = self._simulator.eye_picture(Crop(), eye_width, eye_height)
+        except Exception:  # of a simulator that cannot draw this; its episodes are good
+            LOG.exception("no pictures of the scene are published from now on")
+            self._can_render = False
+            return
+        self._bus.publish(key, Pictures(self._bus.id, step, outside, eye), check=False)
+        self._pictures_at_s = time.monotonic() + PICTURES_PERIOD_S
 
     def _simulation_is_finite(self) -> bool:
         joints, bodies = self._simulator.joints_deg(), self._simulator.bodies()

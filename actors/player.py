@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from actors.attention import clip_action, crop_of_focus, targets_of_action, with_attention_of
 from actors.disturbances.staging import check_abilities, check_staged, stage
-from actors.policies.contract import InformedPolicy, Policy
+from actors.policies.contract import InformedPolicy, ObservablePolicy, Policy
 from actors.simulator import Bodies, Crop, Scene, Simulator
 from actors.tasks.contract import Task
 from actors.view import view_of
 from proto.body import FOCUS
-from proto.episode import Episode, Image, Kind
+from proto.episode import Episode, Floats, Image, Kind
 from proto.suites import Conditions
 from proto.variables import Situation
 
@@ -37,6 +37,7 @@ class LiveStep:
         bodies: where all bodies are before the action.
         scene: what the episode began with.
         crop: the part of the eye image that is seen.
+        pfc: (units,) activity of the policy's PFC; None if it has none.
     """
 
     step: int
@@ -47,6 +48,7 @@ class LiveStep:
     bodies: Bodies
     scene: Scene
     crop: Crop
+    pfc: Floats | None = None
 
 
 def play(
@@ -96,6 +98,7 @@ def play(
     names = tuple(simulator.bodies().places)
     images, crops, actions, targets, joints, poses, outputs = [], [], [], [], [], [], []
     focus = float(task.start[FOCUS])
+    pfc = policy.pfc if isinstance(policy, ObservablePolicy) else lambda: None
     for step, phase in enumerate(task.phases):
         if step == staging.changed_at and isinstance(policy, InformedPolicy):
             policy.change(staging.situation)
@@ -116,6 +119,7 @@ def play(
                     bodies=bodies,
                     scene=staging.scene,
                     crop=crops[-1],
+                    pfc=pfc(),
                 )
             )
         report = simulator.step(targets_of_action(action))

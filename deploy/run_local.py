@@ -14,7 +14,7 @@ from typing import Final
 
 from rich.console import Console
 
-from deploy.processes import BAD_INPUT, programs
+from deploy.processes import BAD_INPUT, VMDNN, Program, programs
 from deploy.supervision import ProcessFailedError, Supervisor, SupervisorEndedError, Watchdog
 from learner.pretrained import PREFIX, pretrained_names
 from proto.bus import Bus, NoHubError, open_bus
@@ -32,6 +32,7 @@ from proto.security import certificate_for
 from services.arguments.common import built_in_names, config_argument, integer
 from services.arguments.process import PRIVATE
 from services.board import Board, RunView
+from services.dashboard.ports import listening_socket, page_address
 from services.machine.ports import port_trouble
 from services.terminal.display import Show, display
 from services.terminal.run_progress import ProgressMeter
@@ -149,11 +150,17 @@ def run(config: Config, actors: Mapping[str, int], console: Console) -> None:
         ProcessFailedError: a process can never work.
         SupervisorEndedError: supervisord was killed.
     """
+    dashboard = dashboard_place(config)
     with owned_run(config.run_folder):  # nothing of the run is touched before
-        _run(config, actors, console)
+        _run(config, actors, dashboard, console)
 
 
-def _run(config: Config, actors: Mapping[str, int], console: Console) -> None:
+def _run(
+    config: Config,
+    actors: Mapping[str, int],
+    dashboard: tuple[str, int] | None,
+    console: Console,
+) -> None:
     started_s = time.monotonic()
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
@@ -169,7 +176,12 @@ def _run(config: Config, actors: Mapping[str, int], console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
-    with Supervisor(programs(config, file, actors), logs) as supervisor:
+    if dashboard is not None:
+        console.print(f"watch it at {page_address(*dashboard)}", highlight=False, soft_wrap=True)
+    started = programs(config, file, actors)
+    if dashboard is not None:
+        started.append(dashboard_program(file, *dashboard))
+    with Supervisor(started, logs) as supervisor:
         watchdog = Watchdog(
             supervisor, lambda text: console.print(text, highlight=False, soft_wrap=True)
         )
@@ -185,6 +197,32 @@ def _run(config: Config, actors: Mapping[str, int], console: Console) -> None:
     if view is not None:
         text = summary(view, config, time.monotonic() - started_s)
         console.print(text, highlight=False, soft_wrap=True)
+
+
+def dashboard_place(config: Config) -> tuple[str, int] | None:
+    """Return address and port of the page that shows the run; None if it is switched off.
+
+    Raises:
+        UserError: it cannot be opened at the address of the configuration.
+    """
+    if not config.dashboard.enabled:
+        return None
+    host = config.dashboard.host
+    with listening_socket(host, config.dashboard.port, or_another=True) as probe:
+        return host, int(probe.getsockname()[1])
+
+
+def dashboard_program(file: Path, host: str, port: int) -> Program:
+    """Return the program that serves the page of a run.
+
+    Args:
+        file: the configuration of the run.
+        host: address at which the page can be opened.
+        port: its port.
+    """
+    place = ("--host", host, "--port", str(port))
+    command = (VMDNN, "dashboard", "--config", str(file), *place)
+    return Program("dashboard", command)
 
 
 def is_done(view: RunView) -> bool:

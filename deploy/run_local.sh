@@ -7,8 +7,8 @@ usage() {
 usage: deploy/run_local.sh [--config FILE] [--actors N|NAME=N,...] [--backend NAME] [--set KEY=VALUE ...]
 
 Sets up this machine if necessary (.venv with the locked packages and, as root or with sudo, a
-graphics driver), then starts hub, learner, evaluator, recorder and actors. Processes that end or
-are stuck are started again. Shows their state until the config's `done` is reached or Ctrl-C is pressed, then
+graphics driver), then starts hub, learner, evaluator, recorder, actors and a page for the browser,
+whose address it prints (--set dashboard.enabled=false leaves it out). Processes that end or are stuck are started again. Shows their state until the config's `done` is reached or Ctrl-C is pressed, then
 stops all processes and prints a summary. The same command continues a run that was stopped.
 
   --config FILE     a file, or the name of a configuration in deploy/config (default:

@@ -101,6 +101,10 @@ class NetworkPolicy:
         self.outputs = np.asarray(outputs, np.float32).ravel()
         return self._code.decode(outputs)
 
+    def pfc(self) -> Floats:
+        """Activity (units,) of the PFC after the last step."""
+        return np.asarray(self._network.pfc(), np.float32)
+
     def states(self, images: Image) -> dict[str, Floats]:
         """Activity (T, units) of each subnet while it sees images (T, 48, 64), from neutral.
 

@@ -332,6 +332,22 @@ class Bus:
 
         return end
 
+    def listen(
+        self, key: str, callback: Callable[[M], None], *classes: type[M]
+    ) -> Callable[[], None]:
+        """Call `callback` with every message of `classes` under a key, for some time.
+
+        Returns:
+            A function that ends it.
+        """
+        subscriber = self._session.declare_subscriber(key, self._receiver(callback, classes))
+
+        def end() -> None:
+            if not self._session.is_closed():
+                subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+        return end
+
     def subscribe_with_sender(
         self, key: str, callback: Callable[[M, Sender], None], *classes: type[M]
     ) -> None:

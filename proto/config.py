@@ -630,6 +630,21 @@ class RecorderConfig(_Section):
     keep: KeepConfig = KeepConfig()
 
 
+class DashboardConfig(_Section):
+    """The page that shows a run in the browser.
+
+    Attributes:
+        enabled: whether deploy/run_local.sh starts it.
+        host: address at which it can be opened; 127.0.0.1 is for this machine only, 0.0.0.0 for
+            others too.
+        port: port of the page. If it is taken, the next free one is used; 0 for any free one.
+    """
+
+    enabled: Switch = True
+    host: Annotated[str, Field(min_length=1, max_length=255)] = "127.0.0.1"
+    port: Annotated[int, Field(strict=True, ge=0, lt=2**16)] = 8080
+
+
 class DoneConfig(_Section):
     """When a run started by deploy/run_local.sh is finished; without conditions it does not end.
 
@@ -663,6 +678,7 @@ class Config(_Section):
     comparison: ComparisonConfig = ComparisonConfig()
     evaluator: EvaluatorConfig = EvaluatorConfig()
     recorder: RecorderConfig = RecorderConfig()
+    dashboard: DashboardConfig = DashboardConfig()
     done: DoneConfig = DoneConfig()
 
     @property
@@ -782,8 +798,13 @@ class Config(_Section):
         return self
 
     def digest(self) -> str:
-        """Hash all values except the section `hub` and `run.folder`; twelve hexadecimal digits."""
-        values = self.model_dump(mode="json", exclude={"hub": True, "run": {"folder"}})
+        """Hash all values that a result may depend on; twelve hexadecimal digits.
+
+        These are all but the sections `hub` and `dashboard`, and `run.folder`.
+        """
+        values = self.model_dump(
+            mode="json", exclude={"hub": True, "dashboard": True, "run": {"folder"}}
+        )
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 

@@ -109,6 +109,10 @@ class Keys:
         """Actor to anyone: `Live`."""
         return f"vmdnn/{self.run}/live/{actor}"
 
+    def pictures(self, actor: str = ANYONE) -> str:
+        """Actor to anyone: `Pictures`."""
+        return f"vmdnn/{self.run}/pictures/{actor}"
+
     def metrics(self, role: Role | str = ANYONE, process: str = ANYONE) -> str:
         """Every process to anyone: its `Metrics`."""
         return f"vmdnn/{self.run}/metrics/{role}/{process}"

@@ -15,6 +15,7 @@ from proto.codec import (
     Blob,
     Integer,
     Many,
+    Maybe,
     Number,
     Size,
     Table,
@@ -41,6 +42,10 @@ from proto.suites import Player, suite_of
 from proto.variables import SituationField
 
 EPISODE_LIMIT: Final = 32 * MEBIBYTE
+OUTSIDE_SIZE: Final = (360, 480, 3)
+"""Height, width and channels of the picture from outside that actors publish."""
+EYE_SIZE: Final = (240, 320, 3)
+"""Height, width and channels of the whole eye's picture that actors publish."""
 POLICY_LIMIT: Final = 130 * MEBIBYTE
 """Size of the largest possible network; in a run its own network sets the limit (bytes)."""
 
@@ -453,6 +458,8 @@ class Live:
             frame, at the same time as the picture.
         focal_px: (2,) float32, as in `proto.episode.View`.
         scene: what does not change in an episode; None in most messages.
+        pfc: (units,) float32, activity of the PFC after this step; None for a policy without one,
+            such as the tutor.
     """
 
     actor: Id
@@ -467,6 +474,27 @@ class Live:
     body_poses: Annotated[Floats, Array("float32", (BODIES, 7), -1e3, 1e3)]
     focal_px: Annotated[Floats, Array("float32", (2,), 1e-3, 1e6)]
     scene: Annotated[LiveScene | None, Added(record_of(LiveScene))] = None
+    pfc: Annotated[
+        Floats | None, Maybe(Array("float32", (Size("units", 1, 4096),), -10.0, 10.0))
+    ] = None
+
+
+@message("pictures", 1, limit=MEBIBYTE)
+@dataclass(frozen=True)
+class Pictures:
+    """What a scene looks like now, in colour.
+
+    Attributes:
+        actor: id of the actor that plays.
+        step: control step, from 0.
+        outside: (360, 480, 3) uint8 RGB, from outside.
+        eye: (240, 320, 3) uint8 RGB, the whole picture of the left eye.
+    """
+
+    actor: Id
+    step: Count
+    outside: Annotated[Image, Array("uint8", OUTSIDE_SIZE)]
+    eye: Annotated[Image, Array("uint8", EYE_SIZE)]
 
 
 class Command(StrEnum):

@@ -131,6 +131,7 @@ def _rows() -> Iterator[Row]:
     for role in (Role.LEARNER, Role.EVALUATOR):
         yield _row(keys.claim(role), (HOLDER_OF[role], (query, reply)))
     yield _row(keys.live(ACTOR_ID), (actor, (put,)), (_LOOKERS, (subscribe,)))
+    yield _row(keys.pictures(ACTOR_ID), (actor, (put,)), (_LOOKERS, (subscribe,)))
     for role in _MEMBERS:
         name = ACTOR_ID if role is Role.ACTOR else _ID
         yield _row(keys.metrics(role, name), (HOLDER_OF[role], (put, subscribe)))

@@ -17,6 +17,7 @@ from proto.messages import (
     EpisodeFailed,
     EpisodeOutcome,
     Live,
+    Pictures,
     PolicyVersion,
     Receipt,
     Rollout,
@@ -83,7 +84,7 @@ def _owner(message: object) -> str:
     match message:
         case Sequence(episode) | Rollout(episode):
             return episode.actor
-        case EpisodeFailed() | EpisodeOutcome() | Live():
+        case EpisodeFailed() | EpisodeOutcome() | Live() | Pictures():
             return message.actor
         case Metrics():
             return f"{message.role}/{message.id}"

@@ -34,6 +34,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "watch": ("services.commands.watch", "show what all processes are doing"),
     "metrics": ("services.commands.metrics", "tell the metrics of a run to Prometheus"),
     "live": ("services.commands.live", "show the actors of a run in Foxglove, as they act"),
+    "dashboard": ("services.commands.dashboard", "show a run in the browser, live"),
     "control": ("services.commands.control", "pause, resume or stop processes of a run"),
     "tutor": ("services.commands.tutor", "record tutoring sequences, without the bus"),
     "train": ("services.commands.train", "train a network on recorded sequences"),

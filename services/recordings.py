@@ -11,7 +11,7 @@ from typing import Final
 from proto.config import KeepConfig
 from proto.episode import Episode, Kind
 from proto.errors import UserError
-from proto.recordings.episodes import read_head
+from proto.recordings.episodes import read_heading
 from proto.storage import delete_file, parts_in
 
 LOG = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class Recordings:
         files = {path: path.stat() for path in folder.glob("*.mcap")}
         for path in sorted(files, key=lambda path: files[path].st_mtime_ns):
             try:
-                self.add(path, read_head(path).kind)
+                self.add(path, read_heading(path).kind)
             except UserError as error:
                 self._bytes += files[path].st_size
                 LOG.warning("is kept, and counted in no limit: %s", error)

@@ -49,6 +49,14 @@ class StatefulPolicy(Policy, Protocol):
 
 
 @runtime_checkable
+class ObservablePolicy(Policy, Protocol):
+    """A policy whose PFC can be watched while it acts."""
+
+    def pfc(self) -> Floats | None:
+        """Return the activity (units,) of the PFC after the last step; None if it has no PFC."""
+
+
+@runtime_checkable
 class InformedPolicy(Policy, Protocol):
     """A policy that knows the situation, such as the tutor, and learns when it changes."""
 

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.policies.contract import InformedPolicy, Policy
+from actors.policies.contract import InformedPolicy, ObservablePolicy, Policy
 from proto.body import ACTION_SIZE, FOCUS, GRASP
 from proto.episode import Floats, Image
 from proto.variables import Situation
@@ -67,3 +67,7 @@ class GuidedPolicy:
         """Return the policy's action (11,), clipped to the range around the tutor's action."""
         self.target = tutored = self._tutor.step(image)
         return self._policy.step(image).clip(tutored - self._slack, tutored + self._slack)
+
+    def pfc(self) -> Floats | None:
+        """Return the activity (units,) of the policy's PFC; None if it has none."""
+        return self._policy.pfc() if isinstance(self._policy, ObservablePolicy) else None

@@ -105,6 +105,25 @@ class MemoryProbe:
 
 
 @dataclass(frozen=True)
+class MeasuredBaseline:
+    """What the tutor or a baseline achieves in situations that were not tutored, as measured once.
+
+    Attributes:
+        name: its name: `tutor`, or one of `Task.baselines`.
+        backend: name of the simulator.
+        trials: number of trials.
+        lenient, strict, precise: number of successes in the three readings.
+    """
+
+    name: str
+    backend: str
+    trials: int
+    lenient: int
+    strict: int
+    precise: int
+
+
+@dataclass(frozen=True)
 class FigureWords:
     """Labels and errors of a task that figures show.
 
@@ -115,6 +134,7 @@ class FigureWords:
             grasp are meaningful only then.
         memory: how it can be tested whether a network remembers a variable; None if nothing must
             be remembered.
+        baselines: what the tutor and the baselines achieve, to compare policies with.
         published: published number of lenient successes and of trials by time constant of the PFC;
             empty if nothing was published.
     """
@@ -123,6 +143,7 @@ class FigureWords:
     errors: tuple[GraspError, ...] = ()
     in_place: Callable[[Outcome], bool] = lambda _: True
     memory: MemoryProbe | None = None
+    baselines: tuple[MeasuredBaseline, ...] = ()
     published: Mapping[float, tuple[int, int]] = field(default_factory=dict)
 
 

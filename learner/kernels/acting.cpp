@@ -256,6 +256,9 @@ class Network {
 
   int features() const { return slow_.units(); }
 
+  // Activity of the PFC after the last call of act.
+  void pfc(float* activity) const { std::copy_n(before_[1].begin(), pfc_units_, activity); }
+
   void reset() {
     fast_.reset();
     slow_.reset();
@@ -291,6 +294,7 @@ class Network {
       : literal_(d.literal),
         values_(d.values),
         softmax_units_(d.softmax_units),
+        pfc_units_(d.levels[0].units),
         fast_(d.maps[0], 1, d.image_height, d.image_width, reader),
         slow_(d.maps[1], d.maps[0].maps, d.maps[0].height, d.maps[0].width, reader),
         levels_{Level(d.levels[0], slow_.units(), d.levels[1].units, reader),
@@ -306,7 +310,7 @@ class Network {
   }
 
   bool literal_;
-  int values_, softmax_units_;
+  int values_, softmax_units_, pfc_units_;
   Maps fast_, slow_;
   Level levels_[3];
   Weights output_weights_;
@@ -341,6 +345,8 @@ void vmdnn_acting_see(Network* network, const float* image, float* seen) {
 void vmdnn_acting_act(Network* network, const float* seen, float* outputs) {
   network->act(seen, outputs);
 }
+
+void vmdnn_acting_pfc(const Network* network, float* activity) { network->pfc(activity); }
 }
 
 }  // namespace vmdnn

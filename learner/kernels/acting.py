@@ -112,9 +112,11 @@ class ActingKernel:
         image: (height, width) float32, brightness -1..1.
         seen: (V_S units,) float32, activity of V_S.
         outputs: (values, softmax units) float32.
+        pfc: (PFC units,) float32, activity of the PFC; `look_at_pfc` writes it.
         reset: returns to the neutral state.
         see: computes `seen`.
         act: computes `outputs`.
+        look_at_pfc: writes the activity after the last call of `act` into `pfc`.
     """
 
     def __init__(self, sizes: NetworkSizes, parameters: Sequence[Floats]) -> None:
@@ -139,12 +141,14 @@ class ActingKernel:
         self.image = np.zeros(sizes.image, np.float32)
         self.seen = np.zeros(slow.maps * slow.height * slow.width, np.float32)
         self.outputs = np.zeros((sizes.values, sizes.softmax_units), np.float32)
-        image, seen, outputs = (
-            array.ctypes.data for array in (self.image, self.seen, self.outputs)
+        self.pfc = np.zeros(sizes.levels[0].units, np.float32)
+        image, seen, outputs, pfc = (
+            array.ctypes.data for array in (self.image, self.seen, self.outputs, self.pfc)
         )
         self.reset = partial(library.vmdnn_acting_reset, network)
         self.see = partial(library.vmdnn_acting_see, network, image, seen)
         self.act = partial(library.vmdnn_acting_act, network, seen, outputs)
+        self.look_at_pfc = partial(library.vmdnn_acting_pfc, network, pfc)
 
 
 def available() -> bool:

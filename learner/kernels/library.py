@@ -40,7 +40,7 @@ def acting_library() -> ctypes.PyDLL | None:
         return None
     pointer = ctypes.c_void_p
     library.vmdnn_acting_new.restype = pointer
-    for name, arguments in (("free", 1), ("reset", 1), ("see", 3), ("act", 3)):
+    for name, arguments in (("free", 1), ("reset", 1), ("see", 3), ("act", 3), ("pfc", 2)):
         function = getattr(library, f"vmdnn_acting_{name}")
         function.argtypes, function.restype = (pointer,) * arguments, None
     return library

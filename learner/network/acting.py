@@ -26,6 +26,9 @@ class ActingNetwork(Protocol):
     def act(self, seen: Array) -> Array:
         """The second half: outputs for what `see` returned."""
 
+    def pfc(self) -> Array:
+        """Activity (units,) of the PFC after the last step."""
+
 
 def make_acting_network(config: NetworkConfig, parameters: Parameters) -> ActingNetwork:
     """A compiled network in float32, or one in numpy where nothing can be compiled.

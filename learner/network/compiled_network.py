@@ -56,6 +56,11 @@ class CompiledNetwork:
         self._kernel.act()
         return self._kernel.outputs.copy()
 
+    def pfc(self) -> Array:
+        """Activity (units,) of the PFC after the last step."""
+        self._kernel.look_at_pfc()
+        return self._kernel.pfc.copy()
+
 
 def _sizes(config: NetworkConfig, by_name: Mapping[str, Subnet]) -> NetworkSizes:
     _, height, width = by_name["vision_input"].shape

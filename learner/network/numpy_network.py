@@ -83,6 +83,10 @@ class NumpyNetwork:
             (self._outputs["input"] @ top + self._outputs["bias"]).reshape(self._output_shape)
         )
 
+    def pfc(self) -> Array:
+        """Activity (units,) of the PFC after the last step."""
+        return self._levels[0].activity()
+
     @property
     def activity(self) -> dict[str, Array]:
         """Activity (units,) of each subnet but V_I and M_O after the last step, by name.

@@ -29,7 +29,7 @@ from typing import Any, Final, NamedTuple
 import cv2
 import numpy as np
 from google.protobuf.message import DecodeError
-from mcap.records import Channel, Metadata
+from mcap.records import Channel, Header, Metadata
 from mcap.records import Message as McapMessage
 from mcap.writer import Writer
 from numpy.typing import NDArray
@@ -259,57 +259,64 @@ def read_summary(path: Path) -> EpisodeSummary:
 
 
 @dataclass(frozen=True)
-class RecordingHead:
-    """What the beginning of a recording tells of its episode; see `Episode`.
+class EpisodeHeading:
+    """What the beginning of a recording says of the episode; see `Episode`.
 
     Attributes:
-        reason: the reason of its outcome; `NO_FAILURE` for a precise one.
+        steps: number of control steps that were played.
     """
 
     id: str
     kind: Kind
     task: str
+    situation: Situation
+    seed: int
     actor: str
+    backend: str
     policy: str
     policy_version: int
-    seed: int
-    situation: Situation
-    reason: str
+    conditions: Conditions | None
+    outcome: Outcome
     started_s: float | None
+    steps: int
 
 
-def read_head(path: Path) -> RecordingHead:
-    """Read what an episode is; only the beginning of the file is read.
+def read_heading(path: Path) -> EpisodeHeading:
+    """Read what a recording says of its episode; only the beginning of the file is read.
 
     Raises:
         UserError: it cannot be read.
     """
-    texts: dict[str, dict[str, str]] = {}
+    metadata: dict[str, dict[str, str]] = {}
     try:
         with path.open("rb") as stream:
             beginning = stream.read(_BEGINNING_BYTES)
         for record in whole_records(beginning):
             if isinstance(record, Metadata):
-                texts[record.name] = record.metadata
-                if record.name == "outcome":  # it comes after the episode and its situation
-                    episode = texts["episode"]
-                    return RecordingHead(
-                        id=episode["id"],
-                        kind=Kind(episode["kind"]),
-                        task=episode["task"],
-                        actor=episode["actor"],
-                        policy=episode["policy"],
-                        policy_version=int(episode["policy_version"]),
-                        seed=int(episode["seed"]),
-                        situation={k: json.loads(v) for k, v in texts["situation"].items()},
-                        reason=record.metadata["reason"],
-                        started_s=_started_s(episode),
-                    )
+                metadata[record.name] = record.metadata
+            elif not isinstance(record, Header):
+                break
+        texts = metadata["episode"]
+        return EpisodeHeading(
+            id=texts["id"],
+            kind=Kind(texts["kind"]),
+            task=texts["task"],
+            situation={k: json.loads(v) for k, v in metadata["situation"].items()},
+            seed=int(texts["seed"]),
+            actor=texts["actor"],
+            backend=texts["backend"],
+            policy=texts["policy"],
+            policy_version=int(texts["policy_version"]),
+            conditions=_conditions(texts),
+            outcome=_outcome(metadata),
+            started_s=_started_s(texts),
+            steps=int(texts["steps"]),
+        )
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
     except (DamageError, *_BROKEN) as error:
-        raise UserError(f"{path} is damaged ({plain(error, 200)})") from error
-    raise UserError(f"{path} is no recording of an episode")
+        problem = plain(error, 200)
+        raise UserError(f"{path} is damaged, or no recording of an episode ({problem})") from error
 
 
 @dataclass(frozen=True)

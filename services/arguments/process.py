@@ -74,7 +74,7 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
     lifecycle.stop_on_signals()
     told = ""
     taken: set[str] = set()
-    with _heartbeat(lifecycle):
+    with heartbeat(lifecycle):
         while not lifecycle.stopping:
             try:
                 with (
@@ -98,7 +98,7 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
                     if effective is not None:
                         make(effective, bus, lifecycle).run()
             except (StorageError, CannotListenError) as error:
-                if lifecycle.stopping or not (_supervised() or isinstance(error, DiskFullError)):
+                if lifecycle.stopping or not (is_supervised() or isinstance(error, DiskFullError)):
                     raise
                 if str(error) != told:
                     LOG.warning("%s. Waiting, and trying again", error)
@@ -110,13 +110,14 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
     return 0
 
 
-def _supervised() -> bool:
+def is_supervised() -> bool:
+    """Whether a supervisor runs this process, and starts it again when it ends."""
     return HEARTBEAT_FILE in os.environ or SYSTEMD_SOCKET in os.environ
 
 
-def _heartbeat(lifecycle: Lifecycle) -> AbstractContextManager[None]:
+def heartbeat(lifecycle: Lifecycle) -> AbstractContextManager[None]:
     """Tell whoever supervises this process that it lives, as long as the main loop goes on."""
-    if not _supervised():
+    if not is_supervised():
         return nullcontext()
     path = os.environ.get(HEARTBEAT_FILE)
     file = None if path is None else Path(path)

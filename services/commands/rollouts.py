@@ -14,7 +14,7 @@ from typing import Any
 from proto.episode import NO_FAILURE, Kind
 from proto.errors import UserError
 from proto.plain_text import plain
-from proto.recordings.episodes import RecordingHead, read_head
+from proto.recordings.episodes import EpisodeHeading, read_heading
 from proto.variables import situation_text
 from services.arguments.common import positive
 from services.terminal.console import make_console
@@ -45,10 +45,10 @@ def run(arguments: argparse.Namespace) -> int:
     if not files:
         raise UserError(f"{folder} holds no recording (*.mcap)")
     console = make_console(stderr=True)
-    found: list[tuple[Path, RecordingHead]] = []
+    found: list[tuple[Path, EpisodeHeading]] = []
     for file in files:
         try:
-            head = read_head(file)
+            head = read_heading(file)
         except UserError as error:
             console.print(plain(f"left out: {error}"), soft_wrap=True)
             continue
@@ -63,25 +63,25 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _is_wanted(head: RecordingHead, arguments: argparse.Namespace) -> bool:
+def _is_wanted(head: EpisodeHeading, arguments: argparse.Namespace) -> bool:
     return (
-        (not arguments.failed or head.reason != NO_FAILURE)
-        and arguments.reason in (None, head.reason, outcome_words(head.reason))
+        (not arguments.failed or head.outcome.reason != NO_FAILURE)
+        and arguments.reason in (None, head.outcome.reason, outcome_words(head.outcome.reason))
         and arguments.kind in (None, head.kind.value)
         and arguments.policy_version in (None, head.policy_version)
     )
 
 
-def _numbers(file: Path, head: RecordingHead) -> dict[str, Any]:
-    return {"file": str(file), **asdict(head)}
+def _numbers(file: Path, head: EpisodeHeading) -> dict[str, Any]:
+    return {"file": str(file), **asdict(head), "reason": head.outcome.reason}
 
 
-def _lines(file: Path, head: RecordingHead) -> Iterator[str]:
+def _lines(file: Path, head: EpisodeHeading) -> Iterator[str]:
     """Yield what a rollout was, its situation, and its file, ready to be copied."""
     played = "time unknown       "
     if head.started_s is not None:
         played = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(head.started_s))
     policy = f"policy {head.policy_version}" if head.policy_version else head.policy
-    yield f"{played}  {head.kind} of {policy}: {outcome_words(head.reason)}"
+    yield f"{played}  {head.kind} of {policy}: {outcome_words(head.outcome.reason)}"
     yield f"    {situation_text(head.situation)}"
     yield f"    {file}"

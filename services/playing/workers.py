@@ -166,10 +166,11 @@ _player: _Player | None = None
 def _begin_worker(config: Config, policy: str) -> None:
     global _arguments  # noqa: PLW0603 - a worker process plays for one pool only
     _arguments = (config, policy)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """End this process when the one that started it ends; runs in a thread of its own."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

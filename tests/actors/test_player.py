@@ -8,7 +8,7 @@ import pytest
 from actors.player import play
 from actors.policies.by_name import make_policy
 from actors.policies.planned import make_tutor
-from actors.simulator import make_simulator
+from actors.simulator import Crop, make_simulator
 from actors.tasks.registry import make_task
 from proto.body import ARM, FOCUS, GRASP, NECK
 from proto.config import SimulatorConfig, TaskConfig, TutorConfig
@@ -147,3 +147,58 @@ def test_with_attention_fixed_the_tutor_neither_turns_its_head_nor_focuses(physi
     np.testing.assert_array_equal(still.actions[:, free], moving.actions[:, free])
     np.testing.assert_array_equal(still.targets[:, free], moving.targets[:, free])
     assert np.ptp(still.joints_deg[:, NECK], axis=0).max() < 0.1
+
+
+class SeenEnoughError(Exception):
+    pass
+
+
+def test_pictures_for_viewers_change_nothing():
+    """Neither what the eye sees in the next steps nor how the robot moves."""
+    simulator = make_simulator(SimulatorConfig())
+
+    def watched(looks_at_step):
+        seen = []
+
+        def on_step(live):
+            seen.append((live.image, live.joints_deg))
+            if live.step == looks_at_step:
+                assert simulator.outside_picture(48, 36).shape == (36, 48, 3)
+                assert simulator.eye_picture(Crop(), 32, 24).shape == (24, 32, 3)
+            if live.step == 24:
+                raise SeenEnoughError
+
+        with pytest.raises(SeenEnoughError):
+            play(
+                simulator,
+                TASK,
+                make_policy("tutor", TASK),
+                TASK.sample(3),
+                seed=3,
+                kind=Kind.PRACTICE,
+                on_step=on_step,
+            )
+        return seen
+
+    for alone, looked_at in zip(watched(None), watched(20), strict=True):
+        assert np.array_equal(alone[0], looked_at[0])
+        assert np.array_equal(alone[1], looked_at[1])
+    simulator.close()
+
+
+def test_the_pfc_of_a_policy_can_be_watched(physics):
+    heard = []
+    for policy in ("tutor", "pretrained:experiment1"):
+        play(
+            physics,
+            TASK,
+            make_policy(policy, TASK),
+            TASK.sample(3),
+            seed=3,
+            kind=Kind.PRACTICE,
+            on_step=lambda live: heard.append(live.pfc),
+        )
+    tutor, network = heard[: len(TASK.phases)], heard[len(TASK.phases) :]
+    assert set(tutor) == {None}
+    assert np.ptp(np.stack(network), axis=0).shape == (20,)
+    assert np.ptp(np.stack(network), axis=0).max() > 0.1

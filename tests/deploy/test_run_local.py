@@ -19,7 +19,15 @@ from processes import eventually
 from run_metrics import EVALUATOR, LEARNER, score, view_of
 
 from deploy.processes import programs
-from deploy.run_local import DEFAULT_CONFIG, actors_of, check_actors, main, summary
+from deploy.run_local import (
+    DEFAULT_CONFIG,
+    actors_of,
+    check_actors,
+    dashboard_place,
+    dashboard_program,
+    main,
+    summary,
+)
 from proto.config import Config, LearnerConfig, load_config
 from proto.run_locks import owned_run
 
@@ -44,7 +52,8 @@ def started(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
     """The smoke run in a folder, in a process group of its own as a terminal would give it."""
     command = (
         str(ROOT / "deploy" / "run_local.sh"), "--config", str(SMOKE), "--actors", "1",
-        "--set", f"run.folder={folder}", "--set", f"hub.endpoint={free_endpoint()}", *arguments,
+        "--set", f"run.folder={folder}", "--set", f"hub.endpoint={free_endpoint()}",
+        "--set", "dashboard.enabled=false", *arguments,
     )  # fmt: skip
     with subprocess.Popen(
         command,
@@ -63,12 +72,13 @@ def started(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 @pytest.mark.timeout(500)  # more than its own limits together
 def test_a_stopped_run_is_continued_to_its_end(tmp_path: Path) -> None:
     run = tmp_path / "smoke"
-    with started(tmp_path) as process:
+    with started(tmp_path, "--set", "dashboard.enabled=true") as process:
         eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept")
         os.killpg(process.pid, signal.SIGINT)  # Ctrl-C
         output, errors = process.communicate(timeout=60)
         assert process.returncode == 0, errors
         assert "starting run smoke with 1 actor" in output
+        assert "watch it at http://127.0.0.1:" in output
         assert not processes_that_name(str(tmp_path))
     kept = {file.name: file.stat().st_mtime_ns for file in run.glob("tutoring/*.mcap")}
 
@@ -127,6 +137,8 @@ def test_a_link_to_the_script_works(tmp_path: Path) -> None:
         ("learner.ratee=1", "learner.ratee"),
         ("learner.rate=fast", "learner.rate"),
         ("hub.endpoint=tcp/192.0.2.1:7447", "can be reached from other machines"),
+        ("dashboard.host=192.0.2.1", "the dashboard cannot listen at 192.0.2.1"),
+        ("dashboard.port=65536", "dashboard.port"),
     ],
 )
 def test_bad_input_starts_nothing(
@@ -184,6 +196,17 @@ def test_threads_and_actors_follow_the_config() -> None:
     assert "--backend" not in by_name["actor"].command
     none = programs(config, Path("config.yaml"), {"sapien": 0})
     assert "actor" not in {program.name for program in none}
+
+
+def test_the_page_has_a_free_port_and_can_be_switched_off() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        place = dashboard_place(load_config(None, [f"dashboard.port={port}"]))
+        assert place is not None
+        assert place[1] not in (0, port)
+        page = dashboard_program(Path("config.yaml"), *place)
+        assert page.command[-4:] == ("--host", "127.0.0.1", "--port", str(place[1]))
+    assert dashboard_place(load_config(None, ["dashboard.enabled=false"])) is None
 
 
 def test_actors_of_several_simulators_are_programs_of_their_own() -> None:

@@ -39,7 +39,7 @@ from proto.messages import (
 )
 from proto.metrics import METRICS, EvaluatorMetrics, HubMetrics, PolicyScore, Success, SuiteScore
 from proto.outbox import Outbox, message_problem
-from proto.recordings.episodes import read_episode, read_kind, read_summary, write_episode
+from proto.recordings.episodes import read_episode, read_heading, read_summary, write_episode
 from proto.recordings.recovery import recover
 from proto.suites import Conditions, Player
 from services.exchange.eipl import import_eipl
@@ -184,7 +184,7 @@ def _recording(folder: Path) -> list[bytes]:
 
 def _read_recording(content: bytes, folder: Path) -> None:
     path = _file(content, folder, "episode.mcap")
-    for read in (read_kind, read_summary):
+    for read in (read_heading, read_summary):
         with suppress(UserError):
             read(path)
     read_episode(path, partial=True)

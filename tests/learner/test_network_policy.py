@@ -46,6 +46,7 @@ def test_acts_as_the_trained_network(
         outputs = (
             trainer.recipe.network(torch.from_numpy(vision_input(images))[None])[0].exp().numpy()
         )
+    pfc = policy.states(images)["pfc"]
     for _ in range(2):  # every episode begins in the neutral state
         policy.begin({"object_y_m": 0.3}, 1)
         for step, image in enumerate(images):
@@ -53,6 +54,7 @@ def test_acts_as_the_trained_network(
             assert action.shape == (11,)
             assert action.dtype == np.float64
             np.testing.assert_allclose(policy.outputs, outputs[step].ravel(), atol=1e-5)
+            np.testing.assert_allclose(policy.pfc(), pfc[step], atol=1e-5)
             assert policy.outputs.dtype == np.float32
 
 

@@ -163,6 +163,8 @@ def test_a_live_step_is_decoded_unchanged() -> None:
     )
     sent = replace(sent, scene=scene)
     assert same(decode(encode(sent), Live), sent)
+    sent = replace(sent, pfc=random.uniform(-1.7, 1.7, 20).astype(np.float32))
+    assert same(decode(encode(sent), Live), sent)
 
 
 @given(length=st.floats(0, 1, exclude_max=True))

@@ -34,6 +34,7 @@ def test_every_key_has_a_row() -> None:
         keys.configuration,
         keys.identity("<actor>"),
         keys.live("<actor>"),
+        keys.pictures("<actor>"),
         *(keys.metrics(role, name) for role, name in ids.items()),
         keys.metrics(),
         *(keys.alive(role, name) for role, name in ids.items()),
@@ -51,7 +52,7 @@ def test_what_matters_most_is_given_to_one_holder_alone() -> None:
     assert holders(keys.verdict, Verb.PUT) == {Holder.EVALUATOR}
     assert all(holders(keys.control(role), Verb.QUERY) <= {Holder.OPERATOR} for role in Role)
     looks = {row.key.split("/")[2] for row in TABLE if row.allowed.get(Holder.WATCHER)}
-    assert looks == {"metrics", "alive", "live"}
+    assert looks == {"metrics", "alive", "live", "pictures"}
 
 
 def test_an_actor_with_a_certificate_of_its_own_is_bound_to_its_name() -> None:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from ports import free_endpoint
 from processes import PATIENCE_S, eventually
@@ -14,10 +15,12 @@ from run_metrics import ACTOR, LEARNER, RUN
 
 from proto.bus import Bus, open_bus, open_hub
 from proto.config import HubConfig
+from proto.episode import Kind
 from proto.keys import Role
-from proto.metrics import ActorMetrics, Metrics
+from proto.messages import EYE_SIZE, OUTSIDE_SIZE, Live, Pictures
+from proto.metrics import ActorMetrics, Metrics, Stage
 from proto.periodic import every
-from services.board import FORGET_AFTER_S, Board
+from services.board import FORGET_AFTER_S, LOSSES_KEPT, ActorView, Board, LiveBoard
 from services.cli import main
 
 
@@ -125,3 +128,78 @@ def test_a_hub_that_cannot_be_reached_is_bad_input(capsys: pytest.CaptureFixture
     endpoint = free_endpoint()
     assert main(["watch", "--connect", endpoint, "--once"]) == 2
     assert endpoint in capsys.readouterr().err
+
+
+def test_losses_are_kept_and_thinned_out(hub: HubConfig) -> None:
+    with open_bus(hub, RUN, Role.WATCH, "w") as bus, join_as(hub, LEARNER) as learner:
+        board = Board(bus)
+        publish(learner, replace(LEARNER, epoch=0))
+        eventually(lambda: bool(board.view().metrics), "the learner is present")
+        for epoch in range(1, 4 * LOSSES_KEPT):
+            publish(learner, replace(LEARNER, epoch=epoch, loss=1.0 / epoch))
+        publish(learner, replace(LEARNER, stage=Stage.FINISHED))
+        eventually(lambda: len(board.losses) > LOSSES_KEPT // 3, "losses are known")
+        epochs = [loss.epoch for loss in board.losses]
+        assert len(epochs) <= LOSSES_KEPT
+        assert epochs == sorted(epochs)
+        assert {loss.stage for loss in board.losses} == {Stage.COUPLED}
+
+
+def step(number: int, focus: float = 3.0) -> Live:
+    return Live(
+        actor="a-1",
+        kind=Kind.TRIAL,
+        policy="p",
+        policy_version=3,
+        step=number,
+        phase="lift",
+        image=np.full((48, 64), number, np.uint8),
+        joints_deg=np.zeros(18, np.float32),
+        action=np.array([0.0] * 10 + [focus], np.float32),
+        body_poses=np.zeros((1, 7), np.float32),
+        focal_px=np.array([50.0, 60.0], np.float32),
+    )
+
+
+def test_only_actors_that_are_watched_are_listened_to(hub: HubConfig) -> None:
+    with open_bus(hub, RUN, Role.WATCH, "w") as bus, join_as(hub, ACTOR) as actor:
+        board, key = LiveBoard(bus, start_focus=1.0), actor.keys.live("a-1")
+        assert not actor.watched(key)
+        board.watch({"a-1"})
+        eventually(lambda: actor.watched(key), "it is watched")
+
+        def heard(number: int, focus: float = 3.0) -> ActorView:
+            actor.publish(key, step(number, focus))
+            eventually(
+                lambda: "a-1" in board.actors() and board.actors()["a-1"].live.step == number,
+                "the step is heard",
+            )
+            return board.actors()["a-1"]
+
+        assert heard(0, focus=7.0).focus == 1.0, "every episode starts so"
+        view = heard(1)
+        assert view.focus == 7.0, "the focus that the step before commanded"
+        assert [live.step for live in view.path] == [0, 1]
+        assert heard(0).episode == view.episode + 1
+        assert [live.step for live in board.actors()["a-1"].path] == [0]
+        board.watch(set())
+        eventually(lambda: not actor.watched(key), "it is not watched any more")
+        assert not board.actors()
+
+
+def test_pictures_are_asked_for_only_while_somebody_looks(hub: HubConfig) -> None:
+    with open_bus(hub, RUN, Role.WATCH, "w") as bus, join_as(hub, ACTOR) as actor:
+        board, key = LiveBoard(bus, start_focus=1.0), actor.keys.pictures("a-1")
+        board.watch({"a-1"})
+        assert not actor.watched(key)
+        board.watch({"a-1"}, {"a-1"})
+        eventually(lambda: actor.watched(key), "pictures are wanted")
+        outside = np.full(OUTSIDE_SIZE, 7, np.uint8)
+        actor.publish(key, Pictures("a-1", 4, outside, np.zeros(EYE_SIZE, np.uint8)))
+        eventually(lambda: board.pictures("a-1") is not None, "pictures have come")
+        told = board.pictures("a-1")
+        assert told is not None
+        assert np.array_equal(told.outside, outside)
+        board.watch({"a-1"})
+        assert board.pictures("a-1") is None
+        eventually(lambda: not actor.watched(key), "nobody looks any more")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from actors.tasks.contract import FigureWords
+from actors.tasks.contract import FigureWords, MeasuredBaseline
 from actors.tasks.experiment1 import judge
 from actors.tasks.grasp_errors import grasp_errors
 from proto.episode import NO_FAILURE, Outcome
@@ -29,5 +29,12 @@ FIGURE_WORDS: Final = FigureWords(
     },
     errors=grasp_errors(judge.TOLERANCE, yaw="object_yaw_deg", y="object_y_m"),
     in_place=_in_place,
+    baselines=(  # docs/results.md
+        MeasuredBaseline("tutor", "sapien", 300, 300, 300, 300),
+        MeasuredBaseline("lookup", "sapien", 300, 263, 236, 177),
+        MeasuredBaseline("obstacle-blind", "sapien", 300, 286, 141, 141),
+        MeasuredBaseline("yaw-blind", "sapien", 300, 162, 140, 72),
+        MeasuredBaseline("replay", "sapien", 300, 123, 56, 11),
+    ),
     published={30.0: (32, 52), 150.0: (44, 52)},
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from actors.tasks.contract import FigureWords, MemoryProbe
+from actors.tasks.contract import FigureWords, MeasuredBaseline, MemoryProbe
 from actors.tasks.experiment2 import judge
 from actors.tasks.experiment2.setting import INDICATED_X
 from actors.tasks.grasp_errors import grasp_errors
@@ -33,5 +33,11 @@ FIGURE_WORDS: Final = FigureWords(
     },
     errors=grasp_errors(judge.TOLERANCE, yaw="indicated_yaw_deg", y="indicated_y_m"),
     in_place=_in_place,
+    baselines=(  # docs/results.md
+        MeasuredBaseline("tutor", "sapien", 500, 500, 500, 500),
+        MeasuredBaseline("pose-blind", "sapien", 150, 148, 148, 78),
+        MeasuredBaseline("kind-blind", "sapien", 100, 44, 3, 3),
+        MeasuredBaseline("last-gesture", "sapien", 60, 26, 26, 26),
+    ),
     memory=MemoryProbe("observe task space", INDICATED_X, "neck_yaw"),
 )
