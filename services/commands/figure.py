@@ -15,6 +15,7 @@ from services.commands.figures import (
     gestures,
     memory,
     time_constants,
+    timeline,
     training,
     trajectories,
 )
@@ -44,6 +45,7 @@ FIGURES: Final[Mapping[str, FigureCommand]] = {
     "corrections": corrections,
     "gestures": gestures,
     "training": training,
+    "timeline": timeline,
 }
 
 

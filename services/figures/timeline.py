@@ -101,9 +101,14 @@ class Timeline:
     @property
     def processes(self) -> list[str]:
         """The learner, then the actors by their ids."""
-        return sorted(
-            {span.process for span in self.spans}, key=lambda name: (name != LEARNER, name)
-        )
+        found = {span.process for span in self.spans}
+        return sorted(found, key=lambda name: (name != LEARNER, name))
+
+    @property
+    def things(self) -> list[str]:
+        """Everything that any process did, in the order of a run."""
+        done = {span.what for span in self.spans}
+        return [what for what in _COLOURS if what in done]
 
     def seconds(self, process: str) -> dict[str, float]:
         """How long a process did each thing (s); `nothing` is the rest of the run."""
@@ -134,17 +139,14 @@ def numbers(timeline: Timeline) -> dict[str, Any]:
 
 def table(timeline: Timeline) -> Table:
     """Return a table of how long each process did what."""
-    done = [what for what in _COLOURS if any(span.what == what for span in timeline.spans)]
     duration_s = timeline.end_s - timeline.start_s
-    result = Table(
-        title=f"run {timeline.run}: {duration_s:.0f} s", caption="seconds", show_lines=False
-    )
-    for heading in ("process", *done, "nothing"):
+    result = Table(title=f"run {timeline.run}: {duration_s:.0f} s", caption="in seconds")
+    columns = (*timeline.things, "nothing")
+    for heading in ("process", *columns):
         result.add_column(heading, justify="left" if heading == "process" else "right")
     for process in timeline.processes:
         spent = timeline.seconds(process)
-        times = (f"{spent[what]:.0f}" if what in spent else "" for what in (*done, "nothing"))
-        result.add_row(process, *times)
+        result.add_row(process, *(f"{spent.get(what, 0.0):.0f}" for what in columns))
     return result
 
 
@@ -155,9 +157,8 @@ def draw(timeline: Timeline) -> Figure:
         figure = Figure(figsize=(7.2, 0.8 + 0.35 * len(processes)), layout="constrained")
         axes = figure.subplots()
         for row, process in enumerate(processes):
-            _draw_row(
-                axes, row, [span for span in timeline.spans if span.process == process], timeline
-            )
+            spans = [span for span in timeline.spans if span.process == process]
+            _draw_row(axes, row, spans, timeline.start_s)
         for version, seen_s in timeline.policies.items():
             minute = (seen_s - timeline.start_s) / 60
             axes.axvline(minute, color="black", linewidth=0.4, linestyle=":")
@@ -173,19 +174,18 @@ def draw(timeline: Timeline) -> Figure:
         axes.invert_yaxis()
         axes.set_xlim(0, (timeline.end_s - timeline.start_s) / 60)
         axes.set_xlabel("time (min); dotted: a policy version is published")
-        shown = [what for what in _COLOURS if any(span.what == what for span in timeline.spans)]
         figure.legend(
-            handles=[Patch(color=_COLOURS[what], label=what) for what in shown],
+            handles=[Patch(color=_COLOURS[what], label=what) for what in timeline.things],
             loc="outside upper center",
-            ncols=len(shown),
+            ncols=len(timeline.things),
         )
         return figure
 
 
-def _draw_row(axes: Axes, row: int, spans: Sequence[Span], timeline: Timeline) -> None:
+def _draw_row(axes: Axes, row: int, spans: Sequence[Span], start_s: float) -> None:
     for what, colour in _COLOURS.items():
         bars = [
-            ((span.start_s - timeline.start_s) / 60, (span.end_s - span.start_s) / 60)
+            ((span.start_s - start_s) / 60, (span.end_s - span.start_s) / 60)
             for span in spans
             if span.what == what
         ]
