@@ -12,6 +12,8 @@ import time
 from pathlib import Path
 from typing import Final
 
+from actors.tasks.registry import make_task
+from proto.acceptance import misfit
 from proto.agreement import OTHER_SETTINGS, digest_of, settings_of
 from proto.bus import Bus, Inbox
 from proto.config import Config
@@ -40,9 +42,14 @@ class Recorder:
     """Writes each rollout once into the run's `rollouts` folder."""
 
     def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle) -> None:
-        """Find what was recorded before, and start to collect rollouts."""
+        """Find what was recorded before, and start to collect rollouts.
+
+        Raises:
+            UserError: the task's options are wrong.
+        """
         self._config = config.recorder
-        self._task = config.task.name
+        self._task = make_task(config.task)
+        self._period_s = config.simulator.control_period_s
         self._digest = digest_of(settings_of(config))
         self._bus = bus
         self._lifecycle = lifecycle
@@ -64,7 +71,7 @@ class Recorder:
                 rollout = self._inbox.take(timeout_s=0.5)
                 self._lifecycle.waits_for("" if rollout else self._missing)
                 if rollout is not None and self._is_recorded(rollout.episode):
-                    self._record(rollout.episode)
+                    self._take(rollout.episode)
 
     def metrics(self) -> RecorderMetrics:
         """Metrics at this moment."""
@@ -88,12 +95,22 @@ class Recorder:
 
     def _is_recorded(self, episode: Episode) -> bool:
         """Whether an episode is a rollout of this run that is to be recorded."""
-        if episode.task != self._task or episode.config_digest != self._digest:
+        if episode.task != self._task.name or episode.config_digest != self._digest:
             self._bus.refuse(f"actor/{episode.actor}", OTHER_SETTINGS)
             return False
         return episode.kind is Kind.TRIAL or (
             self._config.practice and episode.kind is Kind.PRACTICE
         )
+
+    def _take(self, episode: Episode) -> None:
+        """Record a rollout if it is one of the task, and answer its actor."""
+        refusal = plain(misfit(episode, self._task, self._period_s), 1000 - len("..."))
+        if refusal:
+            self._bus.refuse(f"actor/{episode.actor}", refusal)
+        else:
+            self._record(episode)
+        receipt = self._bus.keys.receipt(Role.RECORDER, episode.actor)
+        self._bus.deliver(receipt, Receipt(episode.id, refusal))
 
     def _record(self, episode: Episode) -> None:
         """Write a rollout unless it is there already, such as one that was sent again."""
@@ -109,8 +126,6 @@ class Recorder:
                 *(episode.kind, episode.policy_version, episode.seed),
                 *(plain(episode.outcome.reason), path.name),
             )
-        receipt = self._bus.keys.receipt(Role.RECORDER, episode.actor)
-        self._bus.deliver(receipt, Receipt(episode.id))
 
     def _write(self, path: Path, episode: Episode) -> None:
         when_disk_allows(self._lifecycle, lambda: write_episode(path, episode, robot=self._robot))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fitting import make_policy, settings_digest
+from fitting import fitting_fields, make_policy
 from outcomes import TOUCHED
 from ports import free_endpoint
 from processes import eventually, stop, vmdnn
@@ -84,14 +84,16 @@ class Listener:
 @pytest.fixture
 def rollout(make_episode: MakeEpisode) -> Callable[..., Rollout]:
     def make(name: str, trial: int | None = 0, started_s: float | None = None) -> Rollout:
+        fields = fitting_fields()
+        steps = len(fields["phases"])
         episode = make_episode(
-            20,
+            steps,
             id=name,
             actor="actor",
-            config_digest=settings_digest(),
             kind=Kind.PRACTICE if trial is None else Kind.TRIAL,
             started_s=started_s,
-            outputs=np.full((20, 110), 0.1, dtype=np.float32),
+            outputs=np.full((steps, 110), 0.1, dtype=np.float32),
+            **fields,
         )
         return Rollout(episode=episode, run_id="training")
 
@@ -124,6 +126,39 @@ def test_every_rollout_is_kept_once(
         assert np.array_equal(kept.images, sent[3].episode.images)
         assert kept.outcome == sent[3].episode.outcome
         assert stop(process) == 0
+
+
+def test_what_is_no_episode_of_the_task_is_refused(
+    hub: HubConfig, rollout: Callable[..., Rollout], tmp_path: Path
+) -> None:
+    def changed(name: str, **fields: object) -> Rollout:
+        sent = rollout(name)
+        return replace(sent, episode=replace(sent.episode, **fields))
+
+    with open_bus(hub, RUN, Role.ACTOR, "actor") as bus, recorder(hub, tmp_path):
+        listener = Listener(bus)
+        receipts: list[Receipt] = []
+        bus.subscribe(bus.keys.receipt(Role.RECORDER, "actor"), receipts.append, Receipt)
+        listener.wait_for(lambda metrics: metrics.episodes == 0)
+        actions = rollout("any").episode.actions
+        outside = {"obstacle_x_m": 5.0, "object_y_m": 0.25, "object_yaw_deg": 0.0}
+        sent = [
+            changed("elsewhere", situation=outside),
+            changed("wild", actions=np.full_like(actions, 300.0)),
+            changed("slow", control_period_s=3.0),
+            rollout("good"),
+        ]
+        for message in sent:
+            bus.deliver(bus.keys.rollout("actor"), message)
+        metrics = listener.wait_for(lambda metrics: metrics.episodes == 1)
+        assert metrics.refused == 3
+        eventually(lambda: len(receipts) == 4, "a receipt or a refusal for each")
+        refused = {receipt.episode: receipt.refusal for receipt in receipts}
+        assert "obstacle_x_m" in refused["elsewhere"]
+        assert "actions" in refused["wild"]
+        assert "control steps take 3.0 s" in refused["slow"]
+        assert refused["good"] == ""
+        assert files(tmp_path) == ["good.mcap"]
 
 
 def test_a_restarted_recorder_continues_and_can_keep_trials_only(
