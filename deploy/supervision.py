@@ -102,7 +102,10 @@ class Supervisor:
     """
 
     def __init__(self, programs: Sequence[Program], folder: Path) -> None:
-        """Make a supervisor that writes its configuration and all logs to `folder`."""
+        """Make a supervisor that writes its configuration and all logs to `folder`.
+
+        Entering its context raises UserError if supervisord cannot be started.
+        """
         self.programs = programs
         self._folder = folder.resolve()
         self._process: subprocess.Popen[bytes] | None = None
@@ -252,8 +255,9 @@ class Supervisor:
             except (OSError, HTTPException, SupervisorEndedError) as error:
                 ended = self._process is None or self._process.poll() is not None
                 if ended or time.monotonic() > deadline:
-                    raise RuntimeError(
-                        f"supervisord does not start; try: supervisord -n -c {config}"
+                    raise UserError(
+                        f"supervisord does not start; to see why: {sys.executable} -m"
+                        f" supervisor.supervisord --nodaemon --configuration {config}"
                     ) from error
                 time.sleep(0.1)
             else:

@@ -51,6 +51,15 @@ def test_all_programs_run_under_their_names_and_end_with_the_supervisor(tmp_path
     assert not any(is_alive(process.pid) for process in found.values())
 
 
+def test_a_supervisor_that_cannot_start_says_how_to_see_why(tmp_path: Path) -> None:
+    refused = Program("no:name", SLEEP)
+    with (
+        pytest.raises(UserError, match=r"does not start; to see why: .*supervisord\.conf"),
+        Supervisor([refused], tmp_path),
+    ):
+        pass
+
+
 class Watch:
     """A watchdog over one program, with a clock that is set by hand."""
 
