@@ -233,9 +233,11 @@ class Bus:
         """Log from now on when the hub at an endpoint is lost, and when it is back."""
         LOG.info("connected to the hub at %s", endpoint)
 
-        def look() -> None:
+        def look(closed: zenoh.Transport | None = None) -> None:
             with self._connection:
-                away = not self.peers
+                # The transport that has just closed may still be listed.
+                left = [each.zid for each in self._session.info.transports()]
+                away = not [zid for zid in left if closed is None or zid != closed.zid]
                 if away == self._hub_is_away or self._session.is_closed():
                     return
                 self._hub_is_away = away
@@ -244,8 +246,8 @@ class Bus:
             else:
                 LOG.info("the hub at %s is back", endpoint)
 
-        def on_change(_event: zenoh.TransportEvent) -> None:
-            look()
+        def on_change(event: zenoh.TransportEvent) -> None:
+            look(event.transport if event.kind == zenoh.SampleKind.DELETE else None)
 
         listener = self._session.info.declare_transport_events_listener(on_change)
         self._declared.append(listener)

@@ -22,11 +22,19 @@ from proto.episode import BoxLook, Episode, Kind, View
 from proto.errors import UserError
 from proto.keys import Role
 from proto.messages import (
+    EYE_SIZE,
+    OUTSIDE_SIZE,
+    Claim,
+    ConfigurationRequest,
     EpisodeFailed,
+    EpisodeOutcome,
+    Identity,
     Live,
+    Pictures,
     PolicyVersion,
     Receipt,
     Rollout,
+    RunConfiguration,
     Setting,
     Settings,
     Trial,
@@ -55,7 +63,8 @@ SMALL_NETWORK = (
 )
 MESSAGES = (
     *(SequenceMessage, Rollout, EpisodeFailed, Receipt, TutoringCase, Verdict, TrialRequest),
-    *(Trial, Live, PolicyVersion, Settings, Attachment),
+    *(Trial, Live, Pictures, PolicyVersion, Settings, Attachment, EpisodeOutcome, Claim),
+    *(Identity, ConfigurationRequest, RunConfiguration),
 )
 
 
@@ -123,8 +132,10 @@ def _messages() -> list[object]:
         SequenceMessage(replace(episode, kind=Kind.TUTORING)),
         Rollout(episode, "ab12"),
         EpisodeFailed(
-            *("e1", "actor", Kind.TRIAL, "experiment1", 7, episode.situation, "ab12", 3, "NaN")
+            *("e1", "actor", Kind.TRIAL, "experiment1", 7, episode.situation, "ab12", 3, "NaN"),
+            died=False,
         ),
+        EpisodeOutcome.of(replace(episode, kind=Kind.TRIAL)),
         Receipt("e1", "no"),
         TutoringCase("experiment1", 3, 1),
         Verdict("ab12", 3, "experiment1", 7, episode.situation, outcome, "sapien"),
@@ -132,11 +143,17 @@ def _messages() -> list[object]:
         Trial(1000, episode.conditions),
         Live(
             *("actor", Kind.TRIAL, "run", 3, 1, "lift", episode.images[0]),
-            *(episode.joints_deg[0], episode.actions[0]),
+            *(episode.joints_deg[0], episode.actions[0], episode.body_poses[0]),
+            focal_px=np.ones(2, np.float32),
         ),
+        Pictures("actor", 3, *(np.zeros(size, np.uint8) for size in (OUTSIDE_SIZE, EYE_SIZE))),
         small_policy(),
         Settings(Role.ACTOR, "actor", (Setting("network.pfc.tau", "150.0"),)),
         Attachment.of(b"", "actor/1"),
+        Claim(Role.LEARNER, "learner", "0123456789abcdef", works=True),
+        Identity("0123456789abcdef0123456789abcdef", joined=False),
+        ConfigurationRequest(Role.ACTOR),
+        RunConfiguration("{}", "c0ffee"),
     ]
 
 

@@ -223,7 +223,9 @@ def test_the_newest_policy_reaches_late_joiners_only_once() -> None:
         )
         for version in (1, 2, 3):
             learner.publish_newest(KEYS.policy, policy(version))
-        eventually(lambda: seen["early"] == [1, 2, 3], "every version for who is there")
+        # Of versions that follow one another at once, one may be left out, but not the newest.
+        eventually(lambda: seen["early"][-1:] == [3], "the newest for who is there")
+        assert seen["early"] == sorted(set(seen["early"]))
         late = net.join(Role.ACTOR, "late")
         late.subscribe_newest(
             KEYS.policy, lambda new: seen["late"].append(new.version), PolicyVersion
