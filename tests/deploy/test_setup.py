@@ -176,7 +176,7 @@ def test_a_simulator_that_was_found_to_work_is_examined_when_something_has_chang
         'setup_simulator_once "$@"'
     )
 
-    def times(*arguments: str, status: int = 0, **environment: str) -> int:
+    def times(*arguments: str, status: int = 0, driver: str = "") -> int:
         """How often it is examined by two calls."""
         examined.write_text("")
         for _ in range(2):
@@ -185,7 +185,7 @@ def test_a_simulator_that_was_found_to_work_is_examined_when_something_has_chang
                 cwd=bare,
                 EXAMINED=str(examined),
                 STATUS=str(status),
-                **environment,
+                VK_DRIVER_FILES=driver,
             )
             assert answer.returncode == (1 if status == 1 else 0), answer.stderr
         return len(examined.read_text())
@@ -196,7 +196,7 @@ def test_a_simulator_that_was_found_to_work_is_examined_when_something_has_chang
     assert times("--config", "own.yaml") == 1
     own.write_text("simulator: {backend: mujoco}\n")
     assert times("--config", "own.yaml") == 1
-    assert times("--config", "own.yaml", VK_DRIVER_FILES="/nonexistent.json") == 1
+    assert times("--config", "own.yaml", driver="/nonexistent.json") == 1
     (bare / "venv" / "installed").write_text("other packages")
     assert times("--config", "own.yaml") == 1
     assert times("--actors", "3", status=2) == 2, "bad input says nothing about the simulator"
