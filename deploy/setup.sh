@@ -2,7 +2,7 @@
 # Sourced by run_local.sh, join.sh, certificates.sh and test.sh. `setup` installs what this checkout needs to run: Python, a
 # compiler, the locked packages in .venv, and what the simulator needs: its own packages and a graphics
 # driver. Its arguments are those of run_local.sh, which select the simulator. It installs only what is
-# missing; a second call takes about a second.
+# missing. A second call with the same arguments takes a fraction of a second.
 
 ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 VENV="$ROOT/.venv"
@@ -12,7 +12,7 @@ setup() {
     setup_python
     setup_compiler
     setup_packages
-    setup_simulator "$@"
+    setup_simulator_once "$@"
 }
 
 say() { printf 'setup: %s\n' "$*" >&2; }
@@ -136,18 +136,58 @@ for name in installed_backends(): load_backend(name)')
 
 # --- simulator --------------------------------------------------------------------------------
 
+# `setup_simulator`, unless it has succeeded and nothing has changed since: to render takes seconds. Each
+# actor tries its driver anyway when it starts; if it cannot work, deploy.supervision removes the stamp.
+setup_simulator_once() {
+    local stamp="$VENV/simulator-ready"
+    [[ -f "$stamp" && "$(<"$stamp")" == "$(simulator_depends_on "$@")" ]] && return
+    SIMULATOR_READY=""
+    setup_simulator "$@"
+    [[ -n "$SIMULATOR_READY" ]] || return 0
+    # What was installed just now has changed it. Without permission to write, the next call renders again.
+    { simulator_depends_on "$@" >"$stamp"; } 2>/dev/null || true
+}
+
+# Prints a digest of what decides whether the simulator can render: the arguments and their files, the
+# packages, our code, the system's packages and drivers, the devices, and the machine since it was started.
+simulator_depends_on() {
+    local argument
+    {
+        set +e # much of it is not there on most machines
+        printf '%s\n' "$EUID" "$@"
+        for argument in "$@"; do
+            if [[ -f "${argument#*=}" ]]; then cat "${argument#*=}"; fi
+        done
+        cat "$VENV/installed" "$ROOT"/deploy/config/*.yaml "$ROOT"/actors/backends/{,*/}*.py \
+            "$ROOT/actors/simulator.py" /proc/sys/kernel/random/boot_id
+        env | grep -E '^(VK_|MESA_|EGL_|__EGL|MUJOCO_|PYOPENGL_|NVIDIA_|CUDA_|LD_|PYTHONPATH=|DISPLAY=)' | sort
+        stat --format '%n %s %Y' "$VENV"/lib/python*/site-packages /var/lib/dpkg/status \
+            {/etc,/usr/share,/usr/local/share}/{vulkan/icd.d,glvnd/egl_vendor.d}{,/*}
+        stat --format '%n %a %U %G' /dev/dri{,/*} /dev/nvidia*
+        true
+    } 2>/dev/null | sha256sum
+}
+
 # Each simulator reports whether it can render, and which packages provide its driver.
 setup_simulator() {
-    local answer extra packages status=0
+    local answer extra status=0
     answer="$(examine_simulator "$@" 2>/dev/null)" || status=$?
     if ((status == 3)); then
         for extra in $answer; do install_extra "$extra"; done
         status=0
         answer="$(examine_simulator "$@" 2>/dev/null)" || status=$?
     fi
-    # 2: bad input, such as a simulator that does not exist; run_local.py prints the message
-    if ((status == 0 || status == 2)); then return; fi
-    read -ra packages <<<"$answer"
+    # Bad input, such as a simulator that does not exist; run_local.py prints the message.
+    if ((status == 2)); then return; fi
+    if ((status != 0)); then install_driver "$answer" "$@"; fi
+    SIMULATOR_READY=yes
+}
+
+# Installs the packages that `examine_simulator` has named in its first argument; the others are for it.
+install_driver() {
+    local packages
+    read -ra packages <<<"$1"
+    shift
     if ((${#packages[@]} == 0)); then
         examine_simulator "$@" >/dev/null || fail "the simulator cannot render; see above"
     fi

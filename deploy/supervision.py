@@ -348,6 +348,7 @@ class Watchdog:
 
     def _look_at(self, process: ProcessState, now_s: float) -> None:
         if process.cannot_work:
+            _examine_simulator_again()
             raise ProcessFailedError(process, "cannot work and is not started again")
         if not process.started_s:
             return
@@ -421,6 +422,12 @@ supervisor.rpcinterface_factory=supervisor.rpcinterface:make_main_rpcinterface
         for rank, program in enumerate(programs, start=1)
     ]
     return "\n".join([head, *sections])
+
+
+def _examine_simulator_again() -> None:
+    """Have the next start examine what an earlier start has found good; see deploy/setup.sh."""
+    with contextlib.suppress(OSError):
+        (Path(sys.prefix) / "simulator-ready").unlink(missing_ok=True)
 
 
 def _short_folder() -> tempfile.TemporaryDirectory[str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -56,7 +57,6 @@ class Recorder:
         self._recordings = Recordings(config.run_folder / "rollouts", config.recorder.keep)
         self._inbox: Inbox[Rollout] = bus.inbox(bus.keys.rollout(), Rollout, capacity=WAITING)
         self._monitor = RunMonitor(config, bus)
-        self._robot = _robot()
         self._episodes = 0
         self._bytes = 0
 
@@ -130,11 +130,14 @@ class Recorder:
     def _write(self, path: Path, episode: Episode) -> None:
         when_disk_allows(self._lifecycle, lambda: write_episode(path, episode, robot=self._robot))
 
+    @cached_property
+    def _robot(self) -> SceneUpdate | None:
+        """The robot's meshes; None, with a warning, if this machine cannot build them.
 
-def _robot() -> SceneUpdate | None:
-    """The robot's meshes; None, with a warning, if this machine cannot build them."""
-    try:
-        return robot_meshes()
-    except UserError as error:
-        LOG.warning("viewers will not show the robot in the recordings: %s", error)
-        return None
+        They are read for the first recording: at the start of a run the actors need the processor.
+        """
+        try:
+            return robot_meshes()
+        except UserError as error:
+            LOG.warning("viewers will not show the robot in the recordings: %s", error)
+            return None

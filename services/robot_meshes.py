@@ -6,12 +6,11 @@ from functools import cache
 from typing import Any, Final
 
 import numpy as np
-import trimesh
 
 from actors.backends.robot import build_robot
 from proto.recordings.schemas import SceneUpdate
 from proto.recordings.viewing import set_colour
-from sim_assets.icub_visuals import Visual
+from sim_assets.built_visuals import Visual
 
 GRID_M: Final = 2.0**-11
 """Vertices lie on a grid of half a millimetre: such numbers are packed well."""
@@ -35,6 +34,8 @@ def robot_meshes() -> SceneUpdate:
 
 
 def _add_triangles(triangles: Any, visual: Visual) -> None:
+    import trimesh  # noqa: PLC0415 - it takes a second, and few of those who could show the robot do
+
     mesh = trimesh.load_mesh(visual.mesh)
     mesh.merge_vertices(merge_norm=True)
     triangles.pose.orientation.w = 1.0

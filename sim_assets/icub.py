@@ -21,8 +21,8 @@ from typing import Final
 import icub_models
 import numpy as np
 
-from sim_assets import hand, icub_visuals, urdf
-from sim_assets.icub_visuals import Visual
+from sim_assets import built_visuals, hand, urdf
+from sim_assets.built_visuals import Visual, mesh_files, read_visuals
 from sim_assets.urdf import Vector
 
 SOURCE_MODEL: Final = "iCubGazeboV2_5"
@@ -140,7 +140,7 @@ def build_icub(cache: Path) -> IcubModel:
     official = Path(icub_models.get_model_file(SOURCE_MODEL))
     meshes = official.parents[3]  # SHARE/iCub/robots/MODEL/model.urdf; package:// is SHARE
     source = urdf.Tree(ET.parse(official).getroot())
-    inputs = [official, *icub_visuals.mesh_files(source, meshes)]
+    inputs = [official, *mesh_files(source, meshes)]
     folder = cache / f"icub-{_digest(inputs)}"
     if not folder.is_dir():
         _build_into(folder, source, meshes)
@@ -148,22 +148,25 @@ def build_icub(cache: Path) -> IcubModel:
         urdf=folder / "icub.urdf",
         colliders=COLLIDERS,
         joints=(*JOINT_LIMITS_DEG, *(phalanx.joint for phalanx in hand.PHALANGES)),
-        seen_by_eye=icub_visuals.read_visuals(folder, "eye"),
-        seen_from_outside=icub_visuals.read_visuals(folder, "outside"),
-        seen_in_recordings=icub_visuals.read_visuals(folder, "recorded"),
+        seen_by_eye=read_visuals(folder, "eye"),
+        seen_from_outside=read_visuals(folder, "outside"),
+        seen_in_recordings=read_visuals(folder, "recorded"),
     )
 
 
 def _digest(inputs: Iterable[Path]) -> str:
     """Sixteen hexadecimal digits that change with the input files and with this code."""
-    code = [Path(str(module.__file__)) for module in (hand, icub_visuals, urdf)]
+    code = [Path(str(module.__file__)) for module in (built_visuals, hand, urdf)]
     digest = hashlib.sha256()
-    for path in (*inputs, *code, Path(__file__)):
+    for path in (*inputs, *code, Path(__file__), Path(__file__).with_name("icub_visuals.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
 def _build_into(folder: Path, source: urdf.Tree, meshes: Path) -> None:
+    # Only this needs trimesh, which takes a second to import; and it is done once.
+    from sim_assets import icub_visuals  # noqa: PLC0415
+
     folder.parent.mkdir(parents=True, exist_ok=True)
     unfinished = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", dir=folder.parent))
     try:

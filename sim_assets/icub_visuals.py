@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import trimesh
@@ -19,12 +19,8 @@ from numpy.typing import NDArray
 from trimesh.exchange.ply import export_ply
 
 from sim_assets import hand
+from sim_assets.built_visuals import MANIFEST, Colour, SetName, mesh_path
 from sim_assets.urdf import Matrix, Tree, Vector, find, numbers, origin_pose
-
-Colour = tuple[float, float, float]
-SetName = Literal["eye", "outside", "recorded"]
-
-MANIFEST: Final = "visuals.json"
 
 EYE_LINKS: Final = (
     "chest",
@@ -74,21 +70,6 @@ _TIP: Final[Colour] = (0.05, 0.05, 0.055)
 
 
 @dataclass(frozen=True)
-class Visual:
-    """A mesh of one colour on one link.
-
-    Attributes:
-        link: link that carries it.
-        mesh: PLY file in the link's frame (m).
-        colour: red, green, blue in 0..1, linear.
-    """
-
-    link: str
-    mesh: Path
-    colour: Colour
-
-
-@dataclass(frozen=True)
 class _Part:
     """A mesh of one colour on one link, not yet written.
 
@@ -126,23 +107,6 @@ def write_visuals(folder: Path, source: Tree, meshes: Path, links: Iterable[str]
     (folder / MANIFEST).write_text(json.dumps(listing, indent=1))
 
 
-def read_visuals(folder: Path, name: SetName) -> tuple[Visual, ...]:
-    """Read one of the sets that `write_visuals` wrote."""
-    listing = json.loads((folder / MANIFEST).read_text())
-    return tuple(
-        Visual(entry["link"], folder / name / entry["mesh"], tuple(entry["colour"]))
-        for entry in listing[name]
-    )
-
-
-def mesh_files(source: Tree, meshes: Path) -> list[Path]:
-    """Every mesh file that `write_visuals` may read."""
-    drawn = (link.find("visual/geometry/mesh") for link in source.links.values())
-    return sorted(
-        {_mesh_path(mesh.get("filename", ""), meshes) for mesh in drawn if mesh is not None}
-    )
-
-
 def _write_set(folder: Path, parts: Iterable[_Part]) -> list[dict[str, object]]:
     """Write one mesh for each link and colour into a new folder, and list them."""
     folder.mkdir()
@@ -163,7 +127,7 @@ def _official_parts(source: Tree, meshes: Path, links: Iterable[str]) -> Iterato
         visual = source.links[name].find("visual")
         if visual is not None:
             mesh = find(find(visual, "geometry"), "mesh")
-            shape = trimesh.load_mesh(_mesh_path(mesh.get("filename", ""), meshes))
+            shape = trimesh.load_mesh(mesh_path(mesh.get("filename", ""), meshes))
             scale = np.diag([*numbers(mesh.get("scale", "1 1 1")), 1.0])
             shape.apply_transform(origin_pose(visual) @ scale)
             rgba = find(find(visual, "material"), "color").get("rgba", "")
@@ -189,10 +153,6 @@ def _eyeball_parts() -> Iterator[_Part]:
     for x in (-0.034, 0.034):
         yield _Part("head", _ball(0.016, (x, 0.099, 0.057)), _EYEBALL)
         yield _Part("head", _ball(0.008, (x, 0.097, 0.067)), _SHELL)
-
-
-def _mesh_path(uri: str, meshes: Path) -> Path:
-    return meshes / uri.removeprefix("package://")
 
 
 def _simplified(part: _Part, faces: int) -> _Part:

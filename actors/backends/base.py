@@ -36,7 +36,7 @@ from actors.simulator import (
     StepReport,
 )
 from proto.config import SimulatorConfig
-from sim_assets.icub_visuals import Visual
+from sim_assets.built_visuals import Visual
 
 
 class World(Protocol):

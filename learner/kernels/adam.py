@@ -8,7 +8,7 @@ from typing import Final
 
 from torch import Tensor
 
-from learner.kernels.library import TypedKernel
+from learner.kernels.typed import TypedKernel
 
 _KERNEL: Final = TypedKernel(
     "vmdnn_adam",

@@ -14,7 +14,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from learner.kernels.library import TypedKernel
+from learner.kernels.typed import TypedKernel
 
 _COUNTS: Final = (
     *("levels", "inputs", "values", "softmax_units"),

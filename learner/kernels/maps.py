@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import FunctionCtx
 
-from learner.kernels.library import TypedKernel
+from learner.kernels.typed import TypedKernel
 
 _COUNTS: Final = (
     *("sequences", "steps", "threads", "maps_below", "height_below", "width_below"),

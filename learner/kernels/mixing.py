@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from learner.kernels.library import TypedKernel
+from learner.kernels.typed import TypedKernel
 
 _COUNTS: Final = ("mixtures", "parts", "steps", "inputs", "values", "softmax_units")
 _ARRAYS: Final = (

@@ -20,7 +20,7 @@ from typing import Any, Final, Self
 from proto.config import Config
 from proto.errors import UserError
 from proto.plain_text import plain
-from services.playing.workers import end_with_parent
+from services.playing.parent import end_with_parent
 
 LOG = logging.getLogger(__name__)
 

@@ -29,6 +29,7 @@ from proto.errors import UserError
 from proto.recordings.episodes import write_episode
 from proto.suites import Conditions
 from proto.variables import Situation
+from services.playing.parent import end_with_parent
 from services.robot_meshes import robot_meshes
 
 
@@ -167,14 +168,6 @@ def _begin_worker(config: Config, policy: str) -> None:
     global _arguments  # noqa: PLW0603 - a worker process plays for one pool only
     _arguments = (config, policy)
     threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-def end_with_parent() -> None:
-    """End this process when the one that started it ends; runs in a thread of its own."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _play_in_worker(job: Job) -> Episode:

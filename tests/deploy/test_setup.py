@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
-TOOLS = ("bash", "cat", "dirname", "env")
+TOOLS = ("bash", "cat", "dirname", "env", "readlink")
 
 
 def call(
@@ -152,6 +152,56 @@ def test_the_message_of_a_backend_without_packages_is_printed(bare: Path) -> Non
     assert answer.stderr == (
         "no light.\nbuy a lamp\nsetup: the simulator cannot render; see above\n"
     )
+
+
+COUNTING_PYTHON = """#!/bin/bash
+printf x >>"$EXAMINED"
+exit "$STATUS"
+"""
+"""In place of Python, whose package `actors.backends` tries the simulator."""
+
+
+def test_a_simulator_that_was_found_to_work_is_examined_when_something_has_changed(
+    bare: Path,
+) -> None:
+    python, own = bare / "venv" / "bin" / "python", bare / "own.yaml"
+    python.parent.mkdir(parents=True)
+    python.write_text(COUNTING_PYTHON)
+    python.chmod(0o755)
+    own.write_text("simulator: {backend: sapien}\n")
+    examined = bare / "examined"
+    script = (
+        f"set -euo pipefail; source {bare / 'deploy' / 'setup.sh'}; VENV={bare / 'venv'}\n"
+        "can_install() { return 1; }\n"
+        'setup_simulator_once "$@"'
+    )
+
+    def times(*arguments: str, status: int = 0, driver: str = "") -> int:
+        """How often it is examined by two calls."""
+        examined.write_text("")
+        for _ in range(2):
+            answer = call(
+                *("bash", "-c", script, "setup", *arguments),
+                cwd=bare,
+                EXAMINED=str(examined),
+                STATUS=str(status),
+                VK_DRIVER_FILES=driver,
+            )
+            assert answer.returncode == (1 if status == 1 else 0), answer.stderr
+        return len(examined.read_text())
+
+    assert times() == 1
+    assert times() == 0
+    assert times("--backend", "mujoco") == 1
+    assert times("--config", "own.yaml") == 1
+    own.write_text("simulator: {backend: mujoco}\n")
+    assert times("--config", "own.yaml") == 1
+    assert times("--config", "own.yaml", driver="/nonexistent.json") == 1
+    (bare / "venv" / "installed").write_text("other packages")
+    assert times("--config", "own.yaml") == 1
+    assert times("--actors", "3", status=2) == 2, "bad input says nothing about the simulator"
+    assert times("--actors", "2", status=1) > 2, "it does not work"
+    assert times("--actors", "2") == 1
 
 
 PIP_OUTPUT = """

@@ -144,13 +144,20 @@ def test_a_frozen_process_is_killed_and_started_again(tmp_path: Path) -> None:
         watch.wait_for_another(frozen)
 
 
-def test_a_process_with_bad_input_is_not_started_again(tmp_path: Path) -> None:
+def test_a_process_with_bad_input_is_not_started_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And deploy/setup.sh examines the simulator again, which may be what does not work."""
     command = (sys.executable, "-c", "import sys; print('no such thing'); sys.exit(2)")
+    stamp = tmp_path / "simulator-ready"
+    stamp.touch()
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
     with Supervisor([Program("learner", command)], tmp_path) as supervisor:
         watch = Watch(supervisor)
         eventually(lambda: states(supervisor)["learner"].cannot_work, "it has ended")
         with pytest.raises(ProcessFailedError, match="no such thing"):
             watch.look(1)
+    assert not stamp.exists()
 
 
 def test_when_supervisord_is_killed_even_frozen_processes_end(tmp_path: Path) -> None:

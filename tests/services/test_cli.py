@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import subprocess
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,6 +24,17 @@ def test_it_prints_its_version(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--version"])
     assert ended.value.code == 0
     assert capsys.readouterr().out == f"vmdnn {version('vmdnn')}\n"
+
+
+def test_a_process_that_does_not_learn_starts_without_what_it_never_uses() -> None:
+    """PyTorch alone takes two seconds to import, and a run starts many processes at once."""
+    roles = ("hub", "actor", "evaluator", "recorder", "dashboard")
+    script = (
+        f"import sys, {', '.join(COMMANDS[role][0] for role in roles)}\n"
+        "print(sorted({'torch', 'trimesh', 'sapien', 'mujoco'} & sys.modules.keys()))"
+    )
+    imported = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True)
+    assert imported.stdout == b"[]\n"
 
 
 def test_a_folder_does_not_hide_a_built_in_configuration(

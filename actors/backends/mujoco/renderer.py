@@ -29,7 +29,7 @@ from actors.backends.eye import FAR_M, NEAR_M
 from actors.backends.mujoco import graphics
 from actors.simulator import Array, Bodies, Image, Scene, Screen
 from proto.errors import UserError
-from sim_assets.icub_visuals import Colour, Visual
+from sim_assets.built_visuals import Colour, Visual
 
 PALETTE_STEPS: Final = 24
 """Green divided by red is (n + 1) / PALETTE_STEPS for number n of the palette."""

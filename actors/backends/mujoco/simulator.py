@@ -13,8 +13,8 @@ from actors.backends.mujoco.world import RobotBuilder, World
 from actors.simulator import UNTURNED, Array, Bodies, Diagnosis, Pose, Scene
 from proto.config import SimulatorConfig
 from proto.disturbances import Ability
+from sim_assets.built_visuals import Visual
 from sim_assets.icub import EYE
-from sim_assets.icub_visuals import Visual
 
 
 class MujocoSimulator(BaseSimulator[World, Renderer]):

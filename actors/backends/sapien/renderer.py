@@ -18,7 +18,7 @@ from sapien import render
 
 from actors.backends.eye import FAR_M, NEAR_M
 from actors.simulator import Box, Image, Scene, Screen
-from sim_assets.icub_visuals import Visual
+from sim_assets.built_visuals import Visual
 
 SHADER: Final = Path(__file__).parent / "shader"
 

@@ -14,8 +14,8 @@ from actors.backends.sapien.world import RobotBuilder, World
 from actors.simulator import UNTURNED, Array, Diagnosis, Scene
 from proto.config import SimulatorConfig
 from proto.disturbances import Ability
+from sim_assets.built_visuals import Visual
 from sim_assets.icub import EYE
-from sim_assets.icub_visuals import Visual
 
 
 class SapienSimulator(BaseSimulator[World, Renderer]):
