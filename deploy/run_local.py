@@ -185,11 +185,12 @@ def _run(
         watchdog = Watchdog(
             supervisor, lambda text: console.print(text, highlight=False, soft_wrap=True)
         )
-        for program in supervisor.programs:  # the others wait for the hub while they start
-            supervisor.start(program.name)
+        supervisor.start("hub")
         view = None
         with _connect(config, watchdog, lifecycle) or nullcontext() as bus:
             if bus is not None:
+                for program in supervisor.programs[1:]:
+                    supervisor.start(program.name)
                 show = display(console, ProgressMeter(started_s=started_s), _expected(actors))
                 view = _follow(Board(bus), watchdog, lifecycle, show)
         console.print("stopping", highlight=False)
