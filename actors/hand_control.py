@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 # Scales of the residuals: a deviation of one scale gives a residual of 1.
 _POSITION_M: Final = 0.001
 _YAW_RAD: Final = np.deg2rad(2.0)
-_LEVEL_RAD: Final = np.deg2rad(8.0)
-_STEEP_RAD: Final = np.deg2rad(4.0)
+_LEVEL_RAD: Final = np.deg2rad(15.0)
+_STEEP_RAD: Final = np.deg2rad(8.0)
 _CHANGE_RAD: Final = np.deg2rad(20.0)
 _CLEARANCE_M: Final = 0.002
 _STEEPEST_RAD: Final = np.deg2rad(40.0)
@@ -108,7 +108,7 @@ class HandControl:
                 np.maximum(self._minimum, before - _FASTEST_RAD) - 1e-9,
                 np.minimum(self._maximum, before + _FASTEST_RAD) + 1e-9,
             ),
-            max_nfev=12,
+            max_nfev=6,
             xtol=1e-4,
             ftol=1e-4,
         )

@@ -41,6 +41,8 @@ LOG = logging.getLogger(__name__)
 
 PICTURE_PERIOD_S: Final = 0.15
 """Least time between two pictures while the robot moves."""
+SHOW_AFTER_S: Final = 0.08
+"""When nothing is asked for this time, the robot shows what it has come to."""
 _END_WITHIN_S: Final = 30.0
 
 
@@ -147,16 +149,16 @@ class Robot:
         self._simulator = simulator
         self._begin()
         while True:
-            self._tell(busy=False)
-            with self._changed:
-                while self._wanted is None and not self._ending:
-                    self._changed.wait()
-                if self._ending:
-                    return
-                assert self._wanted is not None
-                number, request = self._wanted
-            self._tell(busy=True)
+            self._tell_state(busy=False)
+            # A request that follows at once, as while a key is held, need not wait for pictures.
+            if not self._is_asked(within_s=SHOW_AFTER_S):
+                self._show()
+                self._is_asked()
+            if self._ending or self._wanted is None:
+                return
+            number, request = self._wanted
             self._problem = ""
+            self._tell_state(busy=True)
             try:
                 self._do(request)
             except UserError as error:
@@ -164,6 +166,13 @@ class Robot:
             self._number = number
             with self._changed:
                 self._wanted = None
+
+    def _is_asked(self, within_s: float | None = None) -> bool:
+        """Wait for a request, or for the end; whether there is one."""
+        with self._changed:
+            return self._changed.wait_for(
+                lambda: self._wanted is not None or self._ending, within_s
+            )
 
     def _do(self, request: Request) -> None:
         """Do what is asked for.
@@ -203,7 +212,7 @@ class Robot:
             if self._stop.is_set():
                 moving.close()
                 return
-            self._tell(busy=True)
+            self._tell_step()
             due_s = self._wait(due_s)
 
     def _wait(self, due_s: float) -> float:
@@ -234,7 +243,7 @@ class Robot:
             nonlocal due_s
             if self._stop.is_set():
                 raise _StoppedError
-            self._tell(busy=True, playing=step)
+            self._tell_step(step)
             due_s = self._wait(due_s)
 
         try:
@@ -276,12 +285,17 @@ class Robot:
         LOG.info("kept a demonstration of %s: %s", name, self._played.outcome.reason)
         self._next_case()
 
-    def _tell(self, *, busy: bool, playing: LiveStep | None = None) -> None:
-        """Tell the state; show pictures too, at most every PICTURE_PERIOD_S while it is busy."""
+    def _tell_state(self, *, busy: bool, playing: LiveStep | None = None) -> None:
         self.feed.put("robot", self._state(busy=busy, playing=playing))
-        now_s = time.monotonic()
-        if now_s < self._pictures_due_s and (busy or self._wanted is not None):
-            return
+
+    def _tell_step(self, playing: LiveStep | None = None) -> None:
+        """Tell a control step; show pictures too, but not for every step."""
+        self._tell_state(busy=True, playing=playing)
+        if time.monotonic() >= self._pictures_due_s:
+            self._show(playing)
+
+    def _show(self, playing: LiveStep | None = None) -> None:
+        """Render all pictures, and tell them."""
         if playing is None:
             crop = crop_of_focus(float(self._demonstration.action[FOCUS]))
         else:

@@ -4,10 +4,10 @@
 import { byId, bytesOf, drawGrey, make, situationText } from "/page/dom.js";
 
 const RETRY_MS = 1500;
-const STEP_M = 0.01;
-const FINE_M = 0.002;
-const TURN_DEG = 5;
-const FINE_DEG = 1;
+const STEP_M = 0.02;
+const FINE_M = 0.004;
+const TURN_DEG = 10;
+const FINE_DEG = 2;
 const HEAD_DEG = 4;
 
 let socket = null;
