@@ -15,6 +15,7 @@ from sim_assets.icub import EYE
 
 Array = NDArray[np.float64]
 Camera = Literal["eye", "outside"]
+CAMERAS: Final[tuple[Camera, ...]] = ("eye", "outside")
 
 OUTSIDE_WIDTH: Final = 480
 OUTSIDE_HEIGHT: Final = 360

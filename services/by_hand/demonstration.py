@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -31,6 +31,7 @@ GAZE_DEG: Final = 5.0
 _NEAR_M: Final = 0.0015
 _NEAR_DEG: Final = 1.0
 _ASTRAY_M: Final = 0.01
+_ASTRAY_DEG: Final = 5.0
 _STILL_DEG: Final = 0.05
 _MOVE_STEPS: Final = 12
 _REACH_STEPS: Final = 80
@@ -169,10 +170,10 @@ class Demonstration:
         """Where the hand is commanded to be."""
         return self._hand.place(self.action[ARM])
 
-    def obey(self, command: Command) -> Iterator[None]:
+    def obey(self, command: Command) -> Generator[None, None, None]:
         """Obey a command; each `next` of the iterator runs one control step.
 
-        If the iterator is not followed to its end, the robot stays where it is.
+        If the iterator is closed before its end, the robot stays where it is.
 
         Raises:
             UserError: the command cannot be obeyed; the robot has not moved.
@@ -276,7 +277,9 @@ class Demonstration:
             case MoveHand(shift_m, turn_deg, own):
                 shift = np.array(shift_m)
                 shift = self._wanted.along_own_axes(shift) if own else shift
-                self._wanted = self._wanted.moved(shift, turn_deg)
+                self._wanted = self._wanted.moved(shift)
+                if turn_deg:  # from what the person sees, even if the hand could not turn so far
+                    self._wanted = HandPlace(self._wanted.centre_m, self._turned(turn_deg))
                 return self._move_hand(_MOVE_STEPS)
             case Focus(by):
                 return self._change_level(FOCUS, by)
@@ -291,6 +294,12 @@ class Demonstration:
         if point is None:
             raise UserError("there is nothing at this place of the picture")
         return point
+
+    def _turned(self, turn_deg: float) -> float:
+        """Return the yaw after a turn (degrees)."""
+        here = self.hand.yaw_deg
+        _, missing_deg = self._hand.misses(self.action[ARM], self._wanted)
+        return (here if missing_deg > _ASTRAY_DEG else self._wanted.yaw_deg) + turn_deg
 
     def _turn_head(self, neck_deg: Array) -> Iterator[Array]:
         start, goal = self.action.copy(), self.action.copy()

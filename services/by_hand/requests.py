@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, get_args
+from typing import Any, Final
 
-from actors.pointing import Camera
+from actors.pointing import CAMERAS, Camera
 from services.by_hand.demonstration import (
     Command,
     Focus,
@@ -86,8 +86,8 @@ def _number(asked: Mapping[str, Any], name: str, least: float, most: float) -> f
 
 
 def _place(asked: Mapping[str, Any]) -> tuple[Camera, float, float]:
-    camera = asked.get("camera")
-    if camera not in get_args(Camera):
+    camera: Camera | None = next((each for each in CAMERAS if each == asked.get("camera")), None)
+    if camera is None:
         raise BadRequestError("there is no such picture")
     return camera, _number(asked, "across", 0.0, 1.0), _number(asked, "down", 0.0, 1.0)
 

@@ -27,7 +27,9 @@ _PARTS: Final = (
 """Arm and hand move at the same time as neck and focus, as in the tutor's plans."""
 
 
-def resample(actions: Array, phases: Sequence[int], durations: Sequence[int], start: Array) -> Array:
+def resample(
+    actions: Array, phases: Sequence[int], durations: Sequence[int], start: Array
+) -> Array:
     """Return the actions (T, 11) of an episode that goes the same way as a person did.
 
     In each phase arm and hand go along the path that the person commanded, in the same order, with

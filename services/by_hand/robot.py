@@ -1,4 +1,4 @@
-"""The robot that a person tutors: one thread that owns the simulator and obeys one request at a time.
+"""The robot that a person tutors: one thread owns the simulator and obeys one request at a time.
 
 It moves only while it obeys. It tells what there is to see through a `Feed`.
 """
@@ -142,7 +142,7 @@ class Robot:
                 self._work(simulator)
             finally:
                 simulator.close()
-        except Exception as error:  # noqa: BLE001 - the main thread tells it and ends
+        except Exception as error:  # the main thread tells it and ends
             self.failed = error
 
     def _work(self, simulator: Simulator) -> None:
@@ -267,7 +267,7 @@ class Robot:
         self._played = episode
 
     def _forget_play_back(self) -> bool:
-        """Go back from the end of the played demonstration to the person's own; whether it was so."""
+        """Go back from a demonstration that was played to the person's own; whether one was."""
         if self._played is None:
             return False
         self._played = None
@@ -278,9 +278,7 @@ class Robot:
         if self._played is None:
             raise UserError("finish the demonstration first, so that you see what will be kept")
         name = self._cases[self._case].name
-        write_episode(
-            _free_file(self._folder, name), self._played, robot=robot_meshes()
-        )
+        write_episode(_free_file(self._folder, name), self._played, robot=robot_meshes())
         self._kept[name] += 1
         LOG.info("kept a demonstration of %s: %s", name, self._played.outcome.reason)
         self._next_case()
@@ -324,7 +322,9 @@ class Robot:
             "problem": self._problem,
             "task": self._task.name,
             "phases": list(self._task.phase_names),
-            "phase": shown.phase if playing is None else self._task.phase_names.index(playing.phase),
+            "phase": shown.phase
+            if playing is None
+            else self._task.phase_names.index(playing.phase),
             "playing": playing is not None,
             "steps": shown.steps if playing is None else playing.step,
             "undo": shown.can_undo or self._played is not None,

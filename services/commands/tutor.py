@@ -72,7 +72,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.by_hand:
         return _run_by_hand(arguments)
     if arguments.port is not None:
-        raise UserError("--port is the port of the page of --by-hand: add --by-hand, or leave it out")
+        raise UserError(
+            "--port is the port of the page of --by-hand: add --by-hand, or leave it out"
+        )
     repeats = [] if arguments.repeats is None else [f"tutor.repeats={arguments.repeats}"]
     config = playing_config(arguments, repeats)
     cases = parse_cases(arguments.cases, make_task(config.task), arguments.seed)

@@ -149,7 +149,7 @@ function show() {
   const [right, forward, up] = robot.hand_mm;
   const rows = [["hand right", centimetres(right)], ["hand forward", centimetres(forward)], ["hand up", centimetres(up)],
     ["hand turned", `${robot.yaw_deg.toFixed(1)}°`], ["grasp", robot.grasp.toFixed(1)], ["focus", robot.focus.toFixed(1)]];
-  byId("readings").replaceChildren(...rows.flatMap(([name, value]) => [make("dt", {}, name), make("dd", { id: name.replace(" ", "-") }, value)]));
+  byId("hand-state").replaceChildren(...rows.flatMap(([name, value]) => [make("dt", {}, name), make("dd", { id: name.replace(" ", "-") }, value)]));
   byId("undo").disabled = moving || !robot.undo;
   byId("restart").disabled = moving || !robot.undo;
   byId("next").disabled = moving || robot.last || robot.outcome !== null;

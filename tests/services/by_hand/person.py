@@ -1,15 +1,16 @@
 """A person who tutors Experiment I through the page: by its keys, buttons and pictures only.
 
-The person knows where things are, as somebody who sees the scene does, and reads the page's readings
-of the hand.
+The person knows where things are, as somebody who sees the scene does, and reads on the page where
+the hand is.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Final
 
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page
 
 PATIENCE_MS: Final = 120_000
 COARSE_CM, FINE_CM = 2.0, 0.4
@@ -28,7 +29,8 @@ _MIDDLE: Final = """([id, colour]) => {
   let [x, y, count] = [0, 0, 0];
   for (let at = 0; at < data.length; at += 4) {
     const [red, green, blue] = [data[at], data[at + 1], data[at + 2]];
-    if (red > 120 && blue < 0.55 * red && (colour === "red" ? green < 0.55 * red : green > 0.75 * red)) {
+    const hue = colour === "red" ? green < 0.55 * red : green > 0.75 * red;
+    if (red > 120 && blue < 0.55 * red && hue) {
       x += (at / 4) % canvas.width; y += Math.floor(at / 4 / canvas.width); count += 1;
     }
   }
@@ -59,7 +61,10 @@ class Person:
         self.bring(right=6, tolerance=1.2)
         self.bring(up=14, tolerance=0.6)
         self.bring(right=object_cm[0], forward=max(object_cm[1], 27), yaw=yaw_deg, tolerance=0.6)
-        self.bring(right=object_cm[0], forward=object_cm[1], up=12.5, yaw=yaw_deg)
+        # Near the body the hand gets to its place, and turns, only a little above the object.
+        for height, tolerance in ((12.5, 1.2), (9.5, 0.6)):
+            self.bring(object_cm[0], object_cm[1], height, tolerance=tolerance)
+        self.bring(object_cm[0], object_cm[1], 9.5, yaw=yaw_deg, tolerance=0.4)
         self.next_phase()  # reach above object
         for _ in range(19):
             self.press("+")
@@ -82,13 +87,19 @@ class Person:
         self.wait()
 
     def wait(self) -> None:
-        expect(self.page.locator("body")).to_have_attribute("data-busy", "false", timeout=PATIENCE_MS)
+        self._await("document.body.dataset.busy === 'false'")
+
+    def _await(self, condition: str) -> None:
+        """Wait for a condition in JavaScript, looking often; `expect` looks less often."""
+        over_s = time.monotonic() + PATIENCE_MS / 1e3
+        while not self.page.evaluate(condition):
+            assert time.monotonic() < over_s, f"never happened: {condition}"
+            self.page.wait_for_timeout(10)
 
     def click(self, picture: str, colour: str) -> None:
         """Click the middle of what has a colour, as soon as the picture shows the present."""
-        done = self.page.locator("body").get_attribute("data-done") or ""
-        expect(self.page.locator("body")).to_have_attribute("data-pictured", done, timeout=PATIENCE_MS)
-        self.page.wait_for_function(f"document.getElementById('{picture}').complete")
+        self._await("document.body.dataset.pictured === document.body.dataset.done")
+        self._await(f"document.getElementById('{picture}').complete")
         middle = self.page.evaluate(_MIDDLE, [picture, colour])
         if middle is None:
             return  # it is not in the picture: the person does without
@@ -112,15 +123,13 @@ class Person:
         tolerance: float = 0.25,
     ) -> None:
         """Bring the hand to a place (cm, degrees) with keys, as well as it goes."""
-        for _ in range(60):
+        for _ in range(40):
             if not self._step((right, forward, up), yaw, tolerance):
                 return
             if self.page.locator("#problem").text_content():
                 return
 
-    def _step(
-        self, wanted_cm: Sequence[float | None], yaw: float | None, tolerance: float
-    ) -> bool:
+    def _step(self, wanted_cm: Sequence[float | None], yaw: float | None, tolerance: float) -> bool:
         """Press one key; False if the hand is there."""
         names = ("hand-right", "hand-forward", "hand-up")
         ways = [
