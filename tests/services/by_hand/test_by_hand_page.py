@@ -148,4 +148,4 @@ def test_a_person_grasps_the_object(tmp_path: Path) -> None:
     epochs = ("--set", "learner.epochs=4", "--set", "learner.pretraining.epochs=2")
     trained = run_vmdnn("train", "--data", folder, "--out", tmp_path / "run", *epochs)
     assert trained.returncode == 0, trained.stderr
-    assert list((tmp_path / "run").rglob("policy-*.safetensors"))
+    assert list((tmp_path / "run" / "policies").glob("*.safetensors"))
