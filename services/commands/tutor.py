@@ -1,4 +1,4 @@
-"""`vmdnn tutor`: record tutored sequences, without the bus."""
+"""`vmdnn tutor`: record tutored sequences, without the bus; those of the tutor, or a person's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,17 @@ from contextlib import closing
 from pathlib import Path
 
 from actors.tasks.registry import make_task
-from services.arguments.common import add_config, add_playing, playing_config, positive, seed
+from proto.errors import UserError
+from services.arguments.common import (
+    LARGEST_PORT,
+    add_config,
+    add_playing,
+    integer,
+    playing_config,
+    positive,
+    seed,
+)
+from services.arguments.logs import start_logging
 from services.playing.tutoring import parse_cases, record, tutoring_jobs
 from services.terminal.console import make_console
 from services.terminal.progress import progress_bar
@@ -40,10 +50,31 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the recordings")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument(
+        "--by-hand",
+        action="store_true",
+        help="a person tutors in the browser; the command serves the page",
+    )
+    parser.add_argument(
+        "--port",
+        type=integer(0, LARGEST_PORT),
+        help="with --by-hand, port of the page, 0 for any free one; without it, dashboard.port of"
+        " the configuration, or the next free one",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Record the sequences that the folder does not have yet, and print the tutor's success."""
+    """Record the sequences that the folder does not have yet, and print the tutor's success.
+
+    Raises:
+        UserError: options contradict each other, or it cannot be recorded there.
+    """
+    if arguments.by_hand:
+        return _run_by_hand(arguments)
+    if arguments.port is not None:
+        raise UserError(
+            "--port is the port of the page of --by-hand: add --by-hand, or leave it out"
+        )
     repeats = [] if arguments.repeats is None else [f"tutor.repeats={arguments.repeats}"]
     config = playing_config(arguments, repeats)
     cases = parse_cases(arguments.cases, make_task(config.task), arguments.seed)
@@ -58,4 +89,19 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps({"folder": str(arguments.out), **tally.as_json()}))
         return 0
     make_console().print(success_table(f"{tally.trials} sequences in {arguments.out}", tally))
+    return 0
+
+
+def _run_by_hand(arguments: argparse.Namespace) -> int:
+    given = {"--repeats": arguments.repeats is not None, "--json": arguments.json}
+    if unfit := [option for option, is_given in given.items() if is_given]:
+        raise UserError(f"{unfit[0]} is of no use with --by-hand: a person shows what they like")
+    # The page needs a web server, which nothing else here does.
+    from services.by_hand.tutoring import tutor_by_hand  # noqa: PLC0415
+
+    start_logging("tutor")
+    config = playing_config(arguments)
+    cases = parse_cases(arguments.cases, make_task(config.task), arguments.seed)
+    kept = tutor_by_hand(config, cases, arguments.out, arguments.port)
+    print(f"{arguments.out} has {kept} sequences that were tutored by hand")
     return 0

@@ -188,8 +188,8 @@ def pictures_text(pictures: Pictures) -> str:
             "topic": "pictures",
             "actor": pictures.actor,
             "step": pictures.step,
-            "outside": _jpeg(pictures.outside),
-            "eye": _jpeg(pictures.eye),
+            "outside": jpeg(pictures.outside),
+            "eye": jpeg(pictures.eye),
         }
     )
 
@@ -361,7 +361,8 @@ def _episode(recording: Recording) -> Mapping[str, Any]:
     }
 
 
-def _jpeg(picture: Image) -> str:
+def jpeg(picture: Image) -> str:
+    """Return an RGB picture (height, width, 3) as JPEG in base64."""
     bgr: NDArray[np.uint8] = np.ascontiguousarray(picture[..., ::-1])
     encoded, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not encoded:

@@ -36,8 +36,10 @@ LOG = logging.getLogger(__name__)
 PAGE: Final = Path(__file__).parent / "page"
 VIEWERS: Final = 32
 """So many browsers may look at the same time."""
-_TOO_MANY: Final = 1013
-_NOT_FOR_YOU: Final = 1008
+TOO_MANY: Final = 1013
+"""Code that closes a connection which may be tried again later."""
+NOT_FOR_YOU: Final = 1008
+"""Code that closes a connection of a page that is not ours."""
 _STOP_WITHIN_S: Final = 10.0
 
 
@@ -49,6 +51,19 @@ def make_app(source: Source, access: Access, videos: Videos) -> FastAPI:
         access: who may do what.
         videos: renders recordings.
     """
+    app = guarded_app(access)
+
+    @app.get("/")
+    async def page() -> FileResponse:
+        return FileResponse(PAGE / "index.html")
+
+    _serve_live(app, source, access)
+    _serve_recordings(app, source, videos)
+    return app
+
+
+def guarded_app(access: Access) -> FastAPI:
+    """Make a web application that answers only requests for its own address, and serves /page."""
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
     @app.middleware("http")
@@ -60,13 +75,7 @@ def make_app(source: Source, access: Access, videos: Videos) -> FastAPI:
         response.headers.update(HEADERS)
         return response
 
-    @app.get("/")
-    async def page() -> FileResponse:
-        return FileResponse(PAGE / "index.html")
-
     app.mount("/page", StaticFiles(directory=PAGE))
-    _serve_live(app, source, access)
-    _serve_recordings(app, source, videos)
     return app
 
 
@@ -79,9 +88,9 @@ def _serve_live(app: FastAPI, source: Source, access: Access) -> None:
         host, origin = headers.get("host"), headers.get("origin")
         await browser.accept()
         if not access.is_for_us(host) or not access.is_from_us(origin, host):
-            await browser.close(_NOT_FOR_YOU, "this page is not one of this dashboard")
+            await browser.close(NOT_FOR_YOU, "this page is not one of this dashboard")
         elif len(viewers) >= VIEWERS:
-            await browser.close(_TOO_MANY, f"{VIEWERS} browsers look at this dashboard already")
+            await browser.close(TOO_MANY, f"{VIEWERS} browsers look at this dashboard already")
         else:
             viewer = Viewer(browser, source, control=access.control)
             viewers.add(viewer)

@@ -126,7 +126,7 @@ class Viewer:
         Raises:
             BadRequestError: it cannot be done.
         """
-        asked = _parsed(text)
+        asked = parsed(text)
         match asked:
             case {"watch": list(actors), "film": list(filmed)}:
                 self._filmed = _ids(filmed)
@@ -166,7 +166,12 @@ class Viewer:
             LOG.info("a browser has left")
 
 
-def _parsed(text: str) -> Any:
+def parsed(text: str) -> Any:
+    """Return what a browser sent as JSON.
+
+    Raises:
+        BadRequestError: it is too long, or no JSON.
+    """
     if len(text) > REQUEST_LETTERS:
         raise BadRequestError("that request is too long")
     try:

@@ -135,7 +135,7 @@ def record(
     Raises:
         UserError: the folder was recorded with another task, simulator or tutor.
     """
-    _save_or_check_config(folder, config)
+    save_or_check_config(folder, config)
     for part in parts_in(folder):
         part.unlink()
     missing = []
@@ -159,8 +159,12 @@ def _recorded(job: Job) -> Episode | None:
         return None  # damaged: the job is played again and replaces the file
 
 
-def _save_or_check_config(folder: Path, config: Config) -> None:
-    """Save the configuration in a new folder; check that it fits the one of an existing folder."""
+def save_or_check_config(folder: Path, config: Config) -> None:
+    """Save the configuration in a new folder; check that it fits the one of an existing folder.
+
+    Raises:
+        UserError: it does not fit.
+    """
     check_recorded(folder, config)
     saved = folder / "config.yaml"
     if not saved.exists():

@@ -1,0 +1,1 @@
+"""A person tutors the robot by hand, from the browser."""
