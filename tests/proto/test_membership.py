@@ -167,7 +167,7 @@ def test_of_two_that_start_at_the_same_moment_one_remains() -> None:
                 competitor.tell("end")
 
 
-@pytest.mark.parametrize("frozen_s", [5.0, 15.0])
+@pytest.mark.parametrize("frozen_s", [5.0, pytest.param(15.0, marks=pytest.mark.slow)])
 def test_of_one_that_was_frozen_and_one_that_started_meanwhile_one_remains(
     tmp_path: Path, frozen_s: float
 ) -> None:

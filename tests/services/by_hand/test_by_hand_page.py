@@ -12,17 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from person import PATIENCE_MS, Person
-from playwright.sync_api import expect, sync_playwright
-from processes import eventually, run_vmdnn, stop, vmdnn
+from processes import eventually, stop, vmdnn
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
 from actors.tasks.registry import make_task
-from learner.tutoring.store import TutoringStore
 from proto.config import Config, SimulatorConfig
-from proto.episode import Kind
-from proto.variables import number_of
 from services.by_hand.robot import Robot
 from services.by_hand.server import make_app
 from services.cli import main
@@ -107,45 +102,3 @@ def test_a_taken_port_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert not (tmp_path / "out").exists()
     assert main([*words, "--json"]) == 2
     assert "--json" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(5400)
-@pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium here; apt-get install chromium")
-def test_a_person_grasps_the_object(tmp_path: Path) -> None:
-    """In at least 18 of 20 situations; a network learns from what was kept, and from the tutor."""
-    task, folder = make_task(Config().task), tmp_path / "shown"
-    cases = ("--cases", f"random:{SITUATIONS}", "--seed", str(FIRST_SEED))
-    with tutoring(folder, *cases) as address, sync_playwright() as playwright:
-        # Chromium refuses to run as root within its sandbox, which containers often are.
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        page = browser.new_page(viewport={"width": 1280, "height": 720})
-        troubles: list[str] = []
-        page.on(
-            "console", lambda said: troubles.append(said.text) if said.type == "error" else None
-        )
-        page.on("pageerror", lambda error: troubles.append(str(error)))
-        page.goto(address)
-        person = Person(page)
-        person.wait()
-        page.select_option("#pace", "0")
-        for number in range(SITUATIONS):
-            situation = task.sample(FIRST_SEED + number)
-            person.tutor({name: number_of(situation, name) for name in situation})
-            person.press("k")
-            expect(page.locator("#kept")).to_have_text(f"{number + 1} kept", timeout=PATIENCE_MS)
-        browser.close()
-    assert troubles == []
-    store = TutoringStore(folder)
-    shown = [store.load(name) for name in store.ids]
-    episodes = [episode for episode in shown if episode is not None]
-    assert len(episodes) == SITUATIONS
-    assert {(each.kind, each.policy) for each in episodes} == {(Kind.TUTORING, "by-hand")}
-    assert sum(each.outcome.lenient for each in episodes) >= 18
-
-    tutor = ("--backend", "mujoco", "--cases", "0-4", "--repeats", "1", "--workers", "1")
-    assert run_vmdnn("tutor", *tutor, "--out", folder).returncode == 0
-    epochs = ("--set", "learner.epochs=4", "--set", "learner.pretraining.epochs=2")
-    trained = run_vmdnn("train", "--data", folder, "--out", tmp_path / "run", *epochs)
-    assert trained.returncode == 0, trained.stderr
-    assert list((tmp_path / "run" / "policies").glob("*.safetensors"))

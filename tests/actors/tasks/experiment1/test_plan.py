@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -89,6 +90,7 @@ def test_gaze_follows_the_point():
     assert below[0] < straight[0] - 5.0
 
 
+@pytest.mark.slow
 def test_fitting_gives_the_postures_in_the_repository():
     fitted, stored = PostureFitter().fit(), load_key_postures()
     for postures in ("object", "obstacle"):
