@@ -73,7 +73,7 @@ def started(folder: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 def test_a_stopped_run_is_continued_to_its_end(tmp_path: Path) -> None:
     run = tmp_path / "smoke"
     with started(tmp_path, "--set", "dashboard.enabled=true") as process:
-        eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept")
+        eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept", 180)
         os.killpg(process.pid, signal.SIGINT)  # Ctrl-C
         output, errors = process.communicate(timeout=60)
         assert process.returncode == 0, errors
@@ -354,7 +354,7 @@ def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> N
     run = tmp_path / "smoke"
     with started(tmp_path) as process:
         eventually(lambda: bool(pid_of("actor", tmp_path)), "an actor runs")
-        eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept")
+        eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept", 180)
         hub, actor = pid_of("hub", tmp_path), pid_of("actor", tmp_path)
         os.kill(hub, signal.SIGSTOP)
         os.kill(actor, signal.SIGKILL)
