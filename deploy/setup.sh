@@ -149,7 +149,8 @@ setup_simulator_once() {
 }
 
 # Prints a digest of what decides whether the simulator can render: the arguments and their files, the
-# packages, our code, the system's packages and drivers, the devices, and the machine since it was started.
+# environment, the packages, our code, the system's packages and drivers, the devices, and the machine since
+# it was started.
 simulator_depends_on() {
     local argument
     {
@@ -160,9 +161,9 @@ simulator_depends_on() {
         done
         cat "$VENV/installed" "$ROOT"/deploy/config/*.yaml "$ROOT"/actors/backends/{,*/}*.py \
             "$ROOT/actors/simulator.py" /proc/sys/kernel/random/boot_id
-        env | grep -E '^(VK_|MESA_|EGL_|__EGL|MUJOCO_|PYOPENGL_|NVIDIA_|CUDA_|LD_|PYTHONPATH=|DISPLAY=)' | sort
+        env | grep -vE '^(_|SHLVL|PWD|OLDPWD|TERM|COLUMNS|LINES)=' | sort
         stat --format '%n %s %Y' "$VENV"/lib/python*/site-packages /var/lib/dpkg/status \
-            {/etc,/usr/share,/usr/local/share}/{vulkan/icd.d,glvnd/egl_vendor.d}{,/*}
+            {/etc,/usr/share,/usr/local/share}/*/*.d{,/*} # the lists of drivers are among these
         stat --format '%n %a %U %G' /dev/dri{,/*} /dev/nvidia*
         true
     } 2>/dev/null | sha256sum

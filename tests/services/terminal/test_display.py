@@ -95,7 +95,8 @@ def test_the_view_fits_the_terminal_from_the_first_second_on(columns: int, rows:
         assert "waiting for sequences: 13 of 45 sequences" in text
         assert "policy 0 of 13" in text
         terminal.press_return()
-        lines = terminal.read_until("epoch 700 of 2500")
+        terminal.read_until("epoch 700 of 2500")
+        lines = terminal.read_until("imprecise 2")  # the last line is drawn last
         text = "\n".join(lines)
         assert "policy 3 of 13" in text
         assert "so far" in text
