@@ -17,7 +17,7 @@ from actors.simulator import Bodies, Crop, Scene, Simulator
 from actors.tasks.contract import Task
 from actors.view import view_of
 from proto.body import FOCUS
-from proto.episode import Episode, Floats, Image, Kind
+from proto.episode import LOCAL, Episode, Floats, Image, Kind
 from proto.suites import Conditions
 from proto.variables import Situation
 
@@ -59,7 +59,7 @@ def play(
     *,
     seed: int,
     kind: Kind,
-    actor: str = "local",
+    actor: str = LOCAL,
     config_digest: str = "",
     on_step: Callable[[LiveStep], None] | None = None,
     conditions: Conditions | None = None,

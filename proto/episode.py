@@ -55,6 +55,8 @@ class Kind(StrEnum):
     PRACTICE = "practice"
 
 
+LOCAL: Final = "local"
+"""Actor of an episode that was played without the bus."""
 NO_FAILURE: Final = "none"
 """The `reason` of a precise outcome."""
 ReasonField = Annotated[str, Text(64, r"[a-z][a-z0-9_]*")]

@@ -27,7 +27,7 @@ from learner.checkpoint import (
 )
 from proto.codec import MessageError
 from proto.config import Config, load_config
-from proto.episode import Kind
+from proto.episode import LOCAL, NOT_FINISHED, SIMULATION_FAILED, Kind
 from proto.errors import UserError
 from proto.outbox import PREPARED, PUT_ASIDE, message_problem
 from proto.recordings.episodes import EpisodeSummary, read_summary
@@ -85,6 +85,7 @@ class Report:
 class _Recorded:
     """What is kept of a recording: enough to compare it with the trial log."""
 
+    place: str
     kind: Kind
     training: str
     trial: tuple[int, str, int]
@@ -156,6 +157,7 @@ def _check_recordings(
             report.findings.append(Finding(where, problem, "move it out of the run's folder"))
         elif path.parent.name == "rollouts":
             rollouts[shown.id] = _Recorded(
+                where,
                 shown.kind,
                 shown.training,
                 (shown.policy_version, _suite(shown), shown.seed),
@@ -173,7 +175,7 @@ def _advice(path: Path) -> str:
 
 
 def _misplaced(path: Path, shown: EpisodeSummary) -> str:
-    if shown.id != path.stem:
+    if path.stem != shown.id and not path.stem.endswith(f"_{shown.id}"):  # see `Recordings.path`
         return f"it holds the episode {shown.id}"
     if shown.kind not in RECORDINGS[path.parent.name]:
         return f"it is an episode of the kind {shown.kind}"
@@ -211,8 +213,8 @@ def _check_trials(
                     "nothing: only the first one counts; report how it came to be",
                 )
             )
-    required = config is None or config.recorder.required
     for trial in trials:
+        required = _is_recorded(trial, config)
         _check_recorded(trial, recorded.get(trial.episode), required, report)
     counted = {trial.episode for trial in trials}
     counted_as = {(trial.run_id, trial.policy_version, trial.suite, trial.seed) for trial in trials}
@@ -221,7 +223,7 @@ def _check_trials(
         if each.kind is Kind.TRIAL and not known:
             report.findings.append(
                 Finding(
-                    f"rollouts/{episode}.mcap",
+                    each.place,
                     "it is a trial that is not counted",
                     "continue the run: the trial is sent again from an outbox, or played again",
                 )
@@ -246,13 +248,23 @@ def _counted_trials(path: Path, where: str, report: Report) -> list[CountedTrial
     return trials
 
 
+def _is_recorded(trial: CountedTrial, config: Config | None) -> bool:
+    """Whether a counted trial must have a recording: it was played to its end, and on the bus."""
+    never_ended = trial.outcome.reason in (SIMULATION_FAILED.reason, NOT_FINISHED.reason)
+    if never_ended or trial.actor == LOCAL:
+        return False
+    if config is None:
+        return True
+    recorder = config.recorder
+    return recorder.required and (recorder.share == 1.0 or not trial.outcome.precise)
+
+
 def _check_recorded(
     trial: CountedTrial, recorded: _Recorded | None, required: bool, report: Report
 ) -> None:
-    place = f"rollouts/{trial.episode}.mcap"
-    simulated = trial.outcome.reason != "simulation_failed"
+    place = f"rollouts/{trial.episode}.mcap" if recorded is None else recorded.place
     if recorded is None:
-        if required and simulated:
+        if required:
             advice = "nothing can be done: the trial stays counted; its recording is lost"
             report.findings.append(
                 Finding(place, "a counted trial has no recording that can be read", advice)

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.box import SIMPLE
 from rich.table import Table
 
 from proto.errors import UserError
@@ -91,7 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _table(found: list[_Found]) -> Table:
     table = Table(
-        box=SIMPLE,
+        box=None,
         padding=(0, 1, 0, 0),
         caption="best: the version with the most reliable success in the first suite",
     )

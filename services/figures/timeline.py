@@ -140,13 +140,15 @@ def numbers(timeline: Timeline) -> dict[str, Any]:
 def table(timeline: Timeline) -> Table:
     """Return a table of how long each process did what."""
     duration_s = timeline.end_s - timeline.start_s
-    result = Table(title=f"run {timeline.run}: {duration_s:.0f} s", caption="in seconds")
-    columns = (*timeline.things, "nothing")
-    for heading in ("process", *columns):
-        result.add_column(heading, justify="left" if heading == "process" else "right")
+    result = Table(title=f"run {timeline.run}: {duration_s:.0f} s")
+    for heading in ("process", "did", "seconds"):
+        result.add_column(heading, justify="right" if heading == "seconds" else "left")
     for process in timeline.processes:
         spent = timeline.seconds(process)
-        result.add_row(process, *(f"{spent.get(what, 0.0):.0f}" for what in columns))
+        done = [what for what in (*timeline.things, "nothing") if what in spent]
+        for number, what in enumerate(done):
+            result.add_row("" if number else process, what, f"{spent[what]:.0f}")
+        result.add_section()
     return result
 
 

@@ -43,7 +43,13 @@ def run(tmp_path: Path, make_episode: Callable[..., Episode]) -> Path:
     for name, kind in (("t1", Kind.TRIAL), ("t2", Kind.TRIAL), ("p1", Kind.PRACTICE)):
         seed = 1000 + int(name[1])
         episode = make_episode(
-            3, id=name, kind=kind, seed=seed, policy_version=VERSIONS, training=RUN_ID
+            3,
+            id=name,
+            kind=kind,
+            seed=seed,
+            policy_version=VERSIONS,
+            training=RUN_ID,
+            actor="actor",
         )
         write_episode(folder / "rollouts" / f"{name}.mcap", episode)
         if kind is Kind.TRIAL:
@@ -98,6 +104,23 @@ def test_nothing_is_wrong_in_a_whole_run(run: Path, capsys: pytest.CaptureFixtur
     assert "nothing is wrong" in told
     assert "3 recordings in rollouts, 2 counted trials, 3 policies" in told
     assert listing(run) == before
+
+
+def test_names_with_the_time_and_trials_without_the_bus_are_fine(run: Path) -> None:
+    for name in ("t1", "t2", "p1"):
+        path = run / "rollouts" / f"{name}.mcap"
+        path.rename(path.with_name(f"20260102-030405-500_{name}.mcap"))
+    log = run / "evaluation" / "trials.jsonl"
+    line = log.read_bytes().splitlines(keepends=True)[0]
+    changed = (
+        *((b'"seed": 1001', b'"seed": 1009'), (b'"episode": "t1"', b'"episode": "u1"')),
+        (b'"actor": "actor"', b'"actor": "local"'),
+    )
+    for old, new in changed:
+        assert old in line
+        line = line.replace(old, new)
+    put(log, log.read_bytes() + line)
+    assert check_run(run).findings == []
 
 
 @pytest.mark.parametrize(
