@@ -141,7 +141,8 @@ def test_nothing_is_lost_by_random_faults(tmp_path: Path) -> None:
     for trial in counted:
         if trial["outcome"]["reason"] == unfinished:
             continue
-        recorded = read_episode(run.folder / "rollouts" / f"{trial['episode']}.mcap")
+        (file,) = (run.folder / "rollouts").glob(f"*{trial['episode']}.mcap")
+        recorded = read_episode(file)
         assert (recorded.policy_version, recorded.seed) == (trial["policy_version"], trial["seed"])
         assert recorded.outcome.precise == trial["outcome"]["precise"]
     shown = [read_episode(path).seed for path in (run.folder / "tutoring").glob("*.mcap")]
