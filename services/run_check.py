@@ -213,8 +213,10 @@ def _check_trials(
                     "nothing: only the first one counts; report how it came to be",
                 )
             )
+    messages = (folder / "outbox").glob("*/rollouts/*.message")
+    sent_later = {path.stem.partition("-")[2] for path in messages}
     for trial in trials:
-        required = _is_recorded(trial, config)
+        required = _is_recorded(trial, config) and trial.episode not in sent_later
         _check_recorded(trial, recorded.get(trial.episode), required, report)
     counted = {trial.episode for trial in trials}
     counted_as = {(trial.run_id, trial.policy_version, trial.suite, trial.seed) for trial in trials}

@@ -26,6 +26,7 @@ from learner.checkpoint import load_checkpoint
 from proto.recordings.episodes import read_episode
 
 FAULTS = int(os.environ.get("VMDNN_FAULTS", "300"))
+UNFINISHED = "could_not_be_finished"
 SEED = int(os.environ.get("VMDNN_FAULT_SEED", "1"))
 TRIALS = 4
 CASES = (0, 22, 44)
@@ -111,8 +112,14 @@ class FaultyRun:
         return [json.loads(line) for line in lines]
 
     def is_complete(self) -> bool:
-        newest = Counter(trial["policy_version"] for trial in self.counted())[VERSIONS]
-        return newest == TRIALS
+        counted = self.counted()
+        newest = Counter(trial["policy_version"] for trial in counted)[VERSIONS]
+        return newest == TRIALS and all(map(self.is_recorded, counted))
+
+    def is_recorded(self, trial: dict[str, Any]) -> bool:
+        """Whether a trial has its recording; one whose actor was killed three times has none."""
+        unfinished = trial["outcome"]["reason"] == UNFINISHED
+        return unfinished or any((self.folder / "rollouts").glob(f"*{trial['episode']}.mcap"))
 
 
 @pytest.mark.faults
@@ -137,9 +144,8 @@ def test_nothing_is_lost_by_random_faults(tmp_path: Path) -> None:
     each = Counter((trial["policy_version"], trial["seed"]) for trial in counted)
     assert set(each.values()) == {1}, "each trial is counted once"
     assert len({trial["run_id"] for trial in counted}) == 1
-    unfinished = "could_not_be_finished"  # its actor was killed three times
     for trial in counted:
-        if trial["outcome"]["reason"] == unfinished:
+        if trial["outcome"]["reason"] == UNFINISHED:
             continue
         (file,) = (run.folder / "rollouts").glob(f"*{trial['episode']}.mcap")
         recorded = read_episode(file)

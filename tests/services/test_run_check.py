@@ -24,7 +24,7 @@ from proto.config import load_config
 from proto.episode import Episode, Kind
 from proto.messages import Receipt, Rollout
 from proto.outbox import Outbox
-from proto.recordings.episodes import write_episode
+from proto.recordings.episodes import read_episode, write_episode
 from services.cli import main
 from services.run_check import check_run
 from services.trials.trial_log import TrialLog
@@ -120,6 +120,15 @@ def test_names_with_the_time_and_trials_without_the_bus_are_fine(run: Path) -> N
         assert old in line
         line = line.replace(old, new)
     put(log, log.read_bytes() + line)
+    assert check_run(run).findings == []
+
+
+def test_a_recording_that_waits_in_an_outbox_is_not_lost(run: Path) -> None:
+    outbox = Outbox(run / "outbox" / "actor" / "rollouts", lambda _key, _wire: None)
+    rollout = read_episode(run / "rollouts" / "t1.mcap")
+    (run / "rollouts" / "t1.mcap").unlink()
+    assert [found.problem for found in check_run(run).findings] != []
+    outbox.add("t1", "vmdnn/run/rollout/actor", encode(Rollout(rollout, RUN_ID)))
     assert check_run(run).findings == []
 
 
