@@ -11,7 +11,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final
-from zlib import crc32
 
 import numpy as np
 
@@ -34,7 +33,7 @@ from learner.policy_message import policy_limit, policy_of
 from proto.agreement import ANSWERING, Agreement
 from proto.bus import Bus
 from proto.codec import MessageError, Wire, encode
-from proto.config import Config, RecorderConfig
+from proto.config import Config
 from proto.disk_waits import when_disk_allows
 from proto.episode import Episode, Kind
 from proto.errors import UserError
@@ -154,16 +153,6 @@ def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
 def _live_scene(live: LiveStep) -> LiveScene:
     view = view_of(live.scene, [])
     return LiveScene(tuple(live.bodies.places), view.boxes, view.fixed_links)
-
-
-def is_recorded(episode: Episode, config: RecorderConfig) -> bool:
-    """Whether the rollout of a trial or of practice goes to recorders.
-
-    Which of the precise ones do so follows from the id: `config.share` of them.
-    """
-    if episode.kind is Kind.PRACTICE and not config.practice:
-        return False
-    return not episode.outcome.precise or crc32(episode.id.encode()) < config.share * 2**32
 
 
 class _StoppedError(Exception):
@@ -621,12 +610,13 @@ class Actor:
         rollout = _encoded(Rollout(episode, episode.training))
         outcome = _encoded(EpisodeOutcome.of(episode))
         # The rollout first: whatever is counted has its recording.
-        if is_recorded(episode, self._config.recorder):
+        recorder, practice = self._config.recorder, episode.kind is Kind.PRACTICE
+        if recorder.records(episode.id, practice=practice, precise=episode.outcome.precise):
             key = keys.rollout(actor)
-            if self._config.recorder.required:
+            if recorder.required:
                 self._keep(self._rollouts, episode, key, rollout, Role.RECORDER)
             elif self._bus.watched(key):
-                self._bus.publish(key, Rollout(episode, episode.training), check=False)
+                self._bus.publish_wire(key, rollout)
         self._keep(self._outcomes, episode, keys.outcome(actor), outcome, Role.EVALUATOR)
 
     def _keep(self, outbox: Outbox, episode: Episode, key: str, wire: Wire, receiver: Role) -> None:

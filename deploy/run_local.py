@@ -86,11 +86,6 @@ class RunConsole(Console):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def default_actors() -> int:
-    """Return one actor for each core; they use the processor time that the learner leaves."""
-    return usable_cores()
-
-
 def actors_of(given: Mapping[str, int] | int | None, config: Config) -> Mapping[str, int]:
     """Return the number of actors by simulator.
 

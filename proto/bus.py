@@ -272,7 +272,11 @@ class Bus:
             message: the message.
             check: check its fields before it is sent; without it, receivers drop an invalid one.
         """
-        self._put(key, encode(message, check=check), zenoh.CongestionControl.DROP)
+        self.publish_wire(key, encode(message, check=check))
+
+    def publish_wire(self, key: str, wire: Wire) -> None:
+        """Publish an encoded message that may be lost."""
+        self._put(key, wire, zenoh.CongestionControl.DROP)
 
     def deliver(self, key: str, message: Any) -> None:
         """Publish a message; waits while the link is full."""

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
+from zlib import crc32
 
 import yaml
 from pydantic import (
@@ -628,6 +629,20 @@ class RecorderConfig(_Section):
     practice: Switch = True
     share: Annotated[float, Field(strict=True, ge=0, le=1)] = 1.0
     keep: KeepConfig = KeepConfig()
+
+    def records(self, episode: str, *, practice: bool, precise: bool) -> bool:
+        """Whether a trial or an episode of practice goes to recorders.
+
+        Which of the precise ones do so follows from the id: `share` of them.
+
+        Args:
+            episode: id of the episode.
+            practice: whether it was played for practice.
+            precise: whether its outcome is precise.
+        """
+        if practice and not self.practice:
+            return False
+        return not precise or crc32(episode.encode()) < self.share * 2**32
 
 
 class DashboardConfig(_Section):

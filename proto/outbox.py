@@ -118,8 +118,8 @@ class Outbox:
         self._lock = threading.Lock()
         self._last_answer_s = clock()
         messages = dict.fromkeys((*died, *sorted(folder.glob("*.message"))))
-        self._entries = {_name_of(path): _Entry(path, _receivers_of(path)) for path in messages}
-        self._of_dead = frozenset(map(_name_of, died))
+        self._entries = {message_name(path): _Entry(path, _receivers_of(path)) for path in messages}
+        self._of_dead = frozenset(map(message_name, died))
         self._put_aside = sum(path.suffix in PUT_ASIDE for path in folder.iterdir())
 
     def __len__(self) -> int:
@@ -262,8 +262,7 @@ class Outbox:
         except _DAMAGE as error:
             with self._lock:
                 self._entries.pop(name, None)
-            problem = plain(error, 300) or type(error).__name__
-            self._set_aside(entry.path, ".damaged", f"is damaged ({problem})")
+            self._set_aside(entry.path, ".damaged", f"is damaged ({_what_is_wrong(error)})")
 
     def _set_aside(self, path: Path, suffix: str, problem: str) -> None:
         try:
@@ -276,7 +275,8 @@ class Outbox:
         LOG.warning("a message %s; it is kept in %s and not sent again", problem, aside)
 
 
-def _name_of(path: Path) -> str:
+def message_name(path: Path) -> str:
+    """The name under which `Outbox.add` got the message of a file."""
     return path.stem.partition("-")[2]
 
 
@@ -287,8 +287,12 @@ def message_problem(path: Path) -> str:
     except FileNotFoundError:
         return ""
     except _DAMAGE as error:
-        return f"it is damaged ({plain(error, 300) or type(error).__name__})"
+        return f"it is damaged ({_what_is_wrong(error)})"
     return ""
+
+
+def _what_is_wrong(error: Exception) -> str:
+    return plain(error, 300) or type(error).__name__
 
 
 def _read_message(path: Path) -> tuple[str, set[Role], Wire]:

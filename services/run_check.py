@@ -29,7 +29,7 @@ from proto.codec import MessageError
 from proto.config import Config, load_config
 from proto.episode import LOCAL, NOT_FINISHED, SIMULATION_FAILED, Kind
 from proto.errors import UserError
-from proto.outbox import PREPARED, PUT_ASIDE, message_problem
+from proto.outbox import PREPARED, PUT_ASIDE, message_name, message_problem
 from proto.recordings.episodes import EpisodeSummary, read_summary
 from services.trials.trial_log import CountedTrial, parse_line
 
@@ -214,7 +214,7 @@ def _check_trials(
                 )
             )
     messages = (folder / "outbox").glob("*/rollouts/*.message")
-    sent_later = {path.stem.partition("-")[2] for path in messages}
+    sent_later = set(map(message_name, messages))
     for trial in trials:
         required = _is_recorded(trial, config) and trial.episode not in sent_later
         _check_recorded(trial, recorded.get(trial.episode), required, report)
@@ -257,8 +257,8 @@ def _is_recorded(trial: CountedTrial, config: Config | None) -> bool:
         return False
     if config is None:
         return True
-    recorder = config.recorder
-    return recorder.required and (recorder.share == 1.0 or not trial.outcome.precise)
+    recorder, precise = config.recorder, trial.outcome.precise
+    return recorder.required and recorder.records(trial.episode, practice=False, precise=precise)
 
 
 def _check_recorded(

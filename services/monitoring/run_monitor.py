@@ -18,19 +18,14 @@ from proto.errors import UserError
 from proto.messages import PolicyVersion
 from proto.periodic import every
 from proto.plain_text import plain
-from proto.storage import StorageError
 from services.board import Board
-from services.monitoring.curves import Curves
-from services.monitoring.event_file import EventFile
-from services.monitoring.history import History, history_file
+from services.monitoring.history_files import HistoryFiles
 from services.monitoring.sample import Sampler
 
 LOG = logging.getLogger(__name__)
 
 PERIOD_S: Final = 1.0
 """Time between two samples at first."""
-FLUSH_S: Final = 10.0
-"""What is kept is written to disk so often; a killed process loses no more."""
 VIDEOS: Final = 200
 """An event file holds videos of the failures of so many policy versions."""
 _POLICIES_WAITING: Final = 4
@@ -55,15 +50,11 @@ class RunMonitor:
         self._config = config
         self._board = Board(bus)
         self._sampler = Sampler()
-        self._history = History(history_file(config.run_folder), period_s=PERIOD_S)
-        self._events = EventFile(config.run_folder, bus.id)
-        self._curves = Curves(self._events)
+        self._files = HistoryFiles(config.run_folder, bus.id, period_s=PERIOD_S)
         self._wanted = {suite.name: len(suite.test_seeds) for suite in config.suites}
         self._policies: deque[PolicyVersion] = deque(maxlen=_POLICIES_WAITING)
         self._failures: deque[Episode] = deque(maxlen=_POLICIES_WAITING)
         self._filmed: set[tuple[str, int]] = set()
-        self._flushed_s = time.monotonic()
-        self._problem = ""
         bus.subscribe_newest(bus.keys.policy, self._policies.append, PolicyVersion)
 
     @contextmanager
@@ -73,7 +64,7 @@ class RunMonitor:
             yield
         try:
             self._work()
-            self._flush()
+            self._files.flush()
         except Exception:
             LOG.exception("the end of the history could not be written")
 
@@ -88,17 +79,16 @@ class RunMonitor:
 
     def _work(self) -> None:
         now_s = time.time()
-        if self._history.is_due(now_s):
+        if self._files.history.is_due(now_s):
             sample = self._sampler.sample(self._board.view(), now_s)
             if sample.says_something:
-                self._history.add(sample)
-                self._curves.add(sample, self._wanted)
+                self._files.history.add(sample)
+                self._files.curves.add(sample, self._wanted)
         while self._policies:
             self._add_weights(self._policies.popleft(), now_s)
         while self._failures:
             self._add_video(self._failures.popleft(), now_s)
-        if time.monotonic() - self._flushed_s >= FLUSH_S:
-            self._flush()
+        self._files.flush_if_due()
 
     def _add_weights(self, policy: PolicyVersion, now_s: float) -> None:
         try:
@@ -106,28 +96,13 @@ class RunMonitor:
         except UserError as error:
             LOG.warning("policy %d is not shown: %s", policy.version, plain(error))
             return
-        self._curves.add_weights(weights, version=policy.version, time_s=now_s)
+        self._files.curves.add_weights(weights, version=policy.version, time_s=now_s)
 
     def _add_video(self, episode: Episode, now_s: float) -> None:
-        self._events.video(
+        self._files.events.video(
             f"failure/{episode.suite}",
             episode.images,
             fps=1.0 / episode.control_period_s,
             step=episode.policy_version,
             time_s=now_s,
         )
-
-    def _flush(self) -> None:
-        """Write to disk. A disk that does not allow it is told of once, and tried again."""
-        self._flushed_s = time.monotonic()
-        try:
-            self._history.flush()
-            self._events.flush()
-        except StorageError as error:
-            if not self._problem:
-                LOG.warning("the history waits: %s", error)
-            self._problem = str(error)
-        else:
-            if self._problem:
-                LOG.info("the history is written again")
-            self._problem = ""

@@ -20,7 +20,6 @@ from outcomes import NOT_LIFTED, PRECISE
 from ports import free_endpoint
 from processes import PATIENCE_S, eventually, listening_hub, stop, vmdnn
 
-from actors.actor import is_recorded
 from actors.left_outboxes import LeftOutboxes
 from actors.receipts import Receipts
 from actors.tasks.experiment1.plan import plan
@@ -564,6 +563,10 @@ def test_old_rollouts_go_to_recorders_and_their_outcomes_to_the_evaluator(
 def test_a_share_of_the_precise_episodes_is_recorded_and_all_others(
     make_episode: MakeEpisode,
 ) -> None:
+    def is_recorded(episode: Episode, config: RecorderConfig) -> bool:
+        practice = episode.kind is Kind.PRACTICE
+        return config.records(episode.id, practice=practice, precise=episode.outcome.precise)
+
     few = RecorderConfig(share=0.25)
     precise = [make_episode(2, id=f"{n}", kind=Kind.TRIAL, outcome=PRECISE) for n in range(400)]
     assert 60 < sum(is_recorded(episode, few) for episode in precise) < 140
