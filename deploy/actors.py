@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from deploy.processes import BAD_INPUT, programs
-from deploy.supervision import ProcessFailedError, Supervisor, SupervisorEndedError, Watchdog
-from proto.errors import UserError
+from deploy.exit_status import exit_status
+from deploy.processes import programs
+from deploy.supervision import Supervisor, Watchdog
 from proto.lifecycle import Lifecycle
 from services.arguments.common import add_process, config_of
 
@@ -31,18 +31,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     add_process(parser)
     parser.add_argument("--backend", help="the simulator; without it, simulator.backend")
     arguments = parser.parse_args(argv)
-    try:
-        _run(arguments)
-    except (UserError, ProcessFailedError) as error:
-        print(f"actors: {error}", file=sys.stderr)
-        return BAD_INPUT
-    except SupervisorEndedError as error:
-        print(f"actors: {error}", file=sys.stderr)
-        return 1
-    return 0
+    return exit_status("actors", lambda: _main(arguments), again="the same command starts it again")
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _main(arguments: argparse.Namespace) -> None:
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
     config = config_of(arguments)

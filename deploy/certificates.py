@@ -24,7 +24,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from deploy.processes import BAD_INPUT
+from deploy.exit_status import exit_status
 from proto.config import HubConfig
 from proto.errors import UserError
 from proto.permissions import Holder
@@ -48,22 +48,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status.
     """
     arguments = _parser().parse_args(argv)
-    try:
-        made = make_certificates(
-            arguments.out or certificate_folder(HubConfig()),
-            hosts=arguments.hosts,
-            actors=arguments.actors,
-            days=arguments.days,
-            renew=arguments.renew,
-        )
-    except UserError as error:
-        print(f"certificates: {error}", file=sys.stderr)
-        return BAD_INPUT
+    return exit_status("certificates", lambda: _main(arguments))
+
+
+def _main(arguments: argparse.Namespace) -> None:
+    made = make_certificates(
+        arguments.out or certificate_folder(HubConfig()),
+        hosts=arguments.hosts,
+        actors=arguments.actors,
+        days=arguments.days,
+        renew=arguments.renew,
+    )
     for file in made:
         print(file)
     if not made:
         print("all certificates are there; --renew makes new ones", file=sys.stderr)
-    return 0
 
 
 def make_certificates(

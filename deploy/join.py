@@ -9,16 +9,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from deploy.processes import BAD_INPUT, VMDNN, Program
+from deploy.exit_status import exit_status
+from deploy.processes import VMDNN, Program
 from deploy.run_local import RunConsole
-from deploy.supervision import ProcessFailedError, Supervisor, SupervisorEndedError, Watchdog
+from deploy.supervision import Supervisor, Watchdog
 from proto.config import Config, load_config
-from proto.errors import UserError
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
 from proto.machine import usable_cores
 from proto.permissions import Holder
-from proto.plain_text import plain_lines
 from proto.run_locks import owned_run
 from proto.security import certificate_for
 from services.arguments.common import integer
@@ -37,21 +36,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status.
     """
     arguments = _parser().parse_args(argv)
-    try:
-        overrides = _overrides(arguments)
-        config = load_config(None, overrides)
-        certificate_for(config.hub, Holder.ACTOR)
-        number = usable_cores() if arguments.actors is None else arguments.actors
-        join(config, _command(arguments, overrides), number)
-    except (UserError, ProcessFailedError) as error:
-        print(f"join: {plain_lines(error)}", file=sys.stderr)
-        return BAD_INPUT
-    except SupervisorEndedError as error:
-        print(f"join: {error}; the same command joins the run again", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:  # before signals were handled: nothing was started
-        return 130
-    return 0
+    return exit_status(
+        "join", lambda: _main(arguments), again="the same command joins the run again"
+    )
+
+
+def _main(arguments: argparse.Namespace) -> None:
+    overrides = _overrides(arguments)
+    config = load_config(None, overrides)
+    certificate_for(config.hub, Holder.ACTOR)
+    number = usable_cores() if arguments.actors is None else arguments.actors
+    join(config, _command(arguments, overrides), number)
 
 
 def join(config: Config, command: Sequence[str], number: int) -> None:

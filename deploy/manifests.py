@@ -13,10 +13,9 @@ from deploy.engines.kubernetes import kubernetes_files
 from deploy.engines.plan import Plan
 from deploy.engines.slurm import slurm_files
 from deploy.engines.systemd import systemd_files
-from deploy.processes import BAD_INPUT
+from deploy.exit_status import exit_status
 from deploy.run_local import check_actors, parse_actors
 from proto.config import load_config
-from proto.errors import UserError
 from proto.storage import written_whole
 from services.arguments.common import config_argument
 
@@ -39,17 +38,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status.
     """
     arguments = _parser().parse_args(argv)
-    try:
-        for path, text in manifests(arguments).items():
-            with written_whole(arguments.out / path) as stream:
-                stream.write(text.encode())
-            if path.endswith(".sh"):
-                (arguments.out / path).chmod(0o755)
-            print(arguments.out / path)
-    except UserError as error:
-        print(f"manifests: {error}", file=sys.stderr)
-        return BAD_INPUT
-    return 0
+    return exit_status("manifests", lambda: _main(arguments))
+
+
+def _main(arguments: argparse.Namespace) -> None:
+    for path, text in manifests(arguments).items():
+        with written_whole(arguments.out / path) as stream:
+            stream.write(text.encode())
+        if path.endswith(".sh"):
+            (arguments.out / path).chmod(0o755)
+        print(arguments.out / path)
 
 
 def manifests(arguments: argparse.Namespace) -> dict[str, str]:

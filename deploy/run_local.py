@@ -14,8 +14,9 @@ from typing import Final
 
 from rich.console import Console
 
-from deploy.processes import BAD_INPUT, VMDNN, Program, programs
-from deploy.supervision import ProcessFailedError, Supervisor, SupervisorEndedError, Watchdog
+from deploy.exit_status import exit_status
+from deploy.processes import VMDNN, Program, programs
+from deploy.supervision import Supervisor, Watchdog
 from learner.pretrained import PREFIX, pretrained_names
 from proto.bus import Bus, NoHubError, open_bus
 from proto.config import Config, load_config
@@ -26,7 +27,6 @@ from proto.machine import usable_cores
 from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore, SuiteScore
 from proto.permissions import Holder
-from proto.plain_text import plain_lines
 from proto.run_locks import owned_run
 from proto.security import certificate_for
 from services.arguments.common import built_in_names, config_argument, integer
@@ -54,27 +54,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status.
     """
     arguments = _parser().parse_args(argv)
-    try:
-        overrides = list(arguments.overrides)
-        if arguments.backend is not None:
-            overrides.append(f"simulator.backend={arguments.backend}")
-        config = load_config(arguments.config, overrides)
-        actors = actors_of(arguments.actors, config)
-        check_actors(actors, config)
-        check_can_be_done(config)
-        certificate_for(config.hub, Holder.HUB)
-        if trouble := port_trouble(config.hub.endpoint):
-            raise UserError(trouble)
-        run(config, actors, RunConsole())
-    except (UserError, ProcessFailedError) as error:
-        print(f"run_local: {plain_lines(error)}", file=sys.stderr)
-        return BAD_INPUT
-    except SupervisorEndedError as error:
-        print(f"run_local: {error}; the same command continues the run", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:  # before signals were handled: nothing was started
-        return 130
-    return 0
+    return exit_status(
+        "run_local", lambda: _main(arguments), again="the same command continues the run"
+    )
+
+
+def _main(arguments: argparse.Namespace) -> None:
+    overrides = list(arguments.overrides)
+    if arguments.backend is not None:
+        overrides.append(f"simulator.backend={arguments.backend}")
+    config = load_config(arguments.config, overrides)
+    actors = actors_of(arguments.actors, config)
+    check_actors(actors, config)
+    check_can_be_done(config)
+    certificate_for(config.hub, Holder.HUB)
+    if trouble := port_trouble(config.hub.endpoint):
+        raise UserError(trouble)
+    run(config, actors, RunConsole())
 
 
 class RunConsole(Console):
