@@ -144,7 +144,8 @@ def test_a_link_to_the_script_works(tmp_path: Path) -> None:
 def test_bad_input_starts_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str, said: str
 ) -> None:
-    assert main(["--set", f"run.folder={tmp_path}", "--set", setting]) == 2
+    settings = [f"run.folder={tmp_path}", f"hub.endpoint={free_endpoint()}", setting]
+    assert main([word for given in settings for word in ("--set", given)]) == 2
     assert said in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
