@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
-from torch.nn.utils.rnn import pad_sequence
 
-from learner.network.vision_input import vision_input
+from learner.network.vision_input import BRIGHTNESS
 from proto.config import PretrainingConfig, RivalConfig
 from proto.episode import Image
 
@@ -19,36 +19,28 @@ def augmented_input(
 ) -> Tensor:
     """Input of the vision (B, T, height, width) for augmented images of B sequences.
 
+    The images of each sequence are shifted alike, their contrast and brightness are changed, and
+    noise is added to each pixel. A shift repeats the rows and columns at the sides.
+
     Args:
         images: grey values (T, height, width) of each sequence; shorter ones are padded with black.
         config: amplitudes `image_shift`, `image_gain` and `image_noise`.
         generator: draws new changes in each call.
     """
-    grey = pad_sequence([torch.from_numpy(each) for each in images], batch_first=True)
-    return augment(torch.from_numpy(vision_input(grey.numpy())), config, generator)
-
-
-def augment(
-    images: Tensor, config: PretrainingConfig | RivalConfig, generator: torch.Generator
-) -> Tensor:
-    """Shift the images of each sequence, change their contrast and brightness, and add noise.
-
-    Args:
-        images: (B, T, height, width) brightness -1..1.
-        config: amplitudes `image_shift`, `image_gain` and `image_noise`.
-        generator: draws new changes in each call.
-    """
-    batch, _, height, width = images.shape
+    batch, longest = len(images), max(len(each) for each in images)
+    height, width = images[0].shape[1:]
     reach = config.image_shift
-    padded = functional.pad(images, (reach,) * 4, mode="replicate")
     corners = torch.randint(2 * reach + 1, (batch, 2), generator=generator).tolist()
-    shifted = torch.stack(
-        [
-            one[:, top : top + height, left : left + width]
-            for one, (top, left) in zip(padded, corners, strict=True)
-        ]
-    )
-    gain, offset = config.image_gain * torch.randn(2, batch, 1, 1, 1, generator=generator)
-    noise = config.image_noise * torch.randn(shifted.shape, generator=generator)
-    result: Tensor = shifted * (1 + gain) + offset + noise
+    gains, offsets = (config.image_gain * torch.randn(2, batch, generator=generator)).numpy()
+    noise = torch.randn(batch, longest, height, width, generator=generator)
+    result = noise.mul_(config.image_noise)
+    for index, (image, (top, left)) in enumerate(zip(images, corners, strict=True)):
+        padded = np.pad(image, ((0, longest - len(image)), (0, 0), (0, 0)))
+        padded = np.pad(padded, ((0, 0), (reach, reach), (reach, reach)), mode="edge")
+        shifted = padded[:, top : top + height, left : left + width]
+        # Bytes have 256 values: looking them up is several times as fast as computing with floats.
+        table = BRIGHTNESS * (1 + gains[index]) + offsets[index]
+        result[index] += torch.from_numpy(cv2.LUT(shifted.reshape(-1, width), table)).view(
+            shifted.shape
+        )
     return result
