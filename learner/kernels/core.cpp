@@ -36,9 +36,12 @@ namespace vmdnn {
 namespace {
 
 constexpr int kTile = 10;   // results of a product in registers; units are padded to its multiples
-constexpr int kSide = 5;    // a tile of a weight gradient is kSide x kSide
-constexpr int kWide = 3;    // vectors of inputs in a tile of the gradient of the input weights
 constexpr int kChunk = 32;  // steps of a chunk
+constexpr bool kManyRegisters = kRegisters == 32;
+constexpr int kSide = 5;    // rows of a tile of a weight gradient
+constexpr int kAcross = kManyRegisters ? 5 : 2;  // columns of such a tile
+constexpr int kWide = kManyRegisters ? 3 : 2;    // vectors in a tile of the input weights' gradient
+static_assert(kTile % kSide == 0 && kTile % kAcross == 0, "sizes are multiples of kTile");
 
 // ---------------------------------------------------------------------------------------------
 // Products
@@ -55,23 +58,26 @@ inline void add_product(const Real* weights, int columns, const Vector<Real>* x,
 }
 
 // sums[i][j] (+)= sum over steps and lanes of left[step][i] right[step][j].
-// Adds to `sums` (rows x columns), whose sizes are multiples of kSide.
+// Adds to `sums` (rows x columns), whose sizes are multiples of kTile.
 template <typename Real>
 void add_outer_products(const Vector<Real>* left, int left_pitch, int rows,
                         const Vector<Real>* right, int right_pitch, int columns, int steps,
                         Real* sums) {
   constexpr int kLanes = Simd<Real>::kLanes;
-  constexpr int kPadded = (kSide * kSide + kLanes - 1) / kLanes * kLanes;
+  constexpr int kPadded = (kSide * kAcross + kLanes - 1) / kLanes * kLanes;
   for (int row = 0; row < rows; row += kSide) {
-    for (int column = 0; column < columns; column += kSide) {
+    for (int column = 0; column < columns; column += kAcross) {
       Vector<Real> tile[kPadded] = {};
       const Vector<Real>* a = left + row;
       const Vector<Real>* b = right + column;
       for (int step = 0; step < steps; ++step, a += left_pitch, b += right_pitch) {
+        Vector<Real> factor[kAcross];
+        for (int j = 0; j < kAcross; ++j) factor[j] = b[j];
 #pragma GCC unroll 5
         for (int i = 0; i < kSide; ++i) {
+          const Vector<Real> row_factor = a[i];
 #pragma GCC unroll 5
-          for (int j = 0; j < kSide; ++j) tile[i * kSide + j] += a[i] * b[j];
+          for (int j = 0; j < kAcross; ++j) tile[i * kAcross + j] += row_factor * factor[j];
         }
       }
       Real results[kPadded];
@@ -80,7 +86,7 @@ void add_outer_products(const Vector<Real>* left, int left_pitch, int rows,
       }
       for (int i = 0; i < kSide; ++i) {
         Real* sum = sums + std::ptrdiff_t(row + i) * columns + column;
-        for (int j = 0; j < kSide; ++j) sum[j] += results[i * kSide + j];
+        for (int j = 0; j < kAcross; ++j) sum[j] += results[i * kAcross + j];
       }
     }
   }
@@ -960,7 +966,7 @@ int compute(const CoreProblem<Real>* problem) {
 
 // Does `rounds` rounds of multiply-adds on registers alone; returns the floating point operations.
 double multiply_add(long rounds) {
-  constexpr int kChains = 16;  // enough to fill the pipelines of two units
+  constexpr int kChains = 12;  // enough to fill the pipelines of two units, and they fit the registers
   Vector<float> sums[kChains] = {};
   Vector<float> factor = Vector<float>{} + 0.999f;
   asm volatile("" : "+m"(factor));  // unknown to the compiler

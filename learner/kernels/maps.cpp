@@ -21,7 +21,9 @@ namespace vmdnn {
 namespace {
 
 constexpr int kMapsAtOnce = 3;   // maps of a tile
-constexpr int kUnitsAtOnce = 8;  // neighbouring units of a tile
+// Neighbouring units of a tile, or taps of a kernel: registers hold all sums of a tile, besides what
+// they are summed from.
+constexpr int kUnitsAtOnce = kRegisters == 32 ? 8 : 3;
 constexpr int kRowsAtOnce = 6;   // rows whose activity stays in the cache for a kernel's gradient
 constexpr int kSegment = 512;    // units that are integrated together
 
@@ -156,10 +158,13 @@ void add_kernel_gradient(const Shape& shape, const Vector<Real>* x, const Vector
                 deltas + map * area + std::ptrdiff_t(row) * shape.columns;
             for (int column = 0; column < shape.columns;
                  ++column, ++delta, factor += shape.stride) {
-#pragma GCC unroll 4
-              for (int i = 0; i < kMaps; ++i) {
+              Vector<Real> of_map[kMaps];
+              for (int i = 0; i < kMaps; ++i) of_map[i] = delta[i * area];
 #pragma GCC unroll 8
-                for (int j = 0; j < kTaps; ++j) sums[i * kTaps + j] += delta[i * area] * factor[j];
+              for (int j = 0; j < kTaps; ++j) {
+                const Vector<Real> below = factor[j];
+#pragma GCC unroll 4
+                for (int i = 0; i < kMaps; ++i) sums[i * kTaps + j] += of_map[i] * below;
               }
             }
           }

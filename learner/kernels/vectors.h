@@ -19,6 +19,12 @@ constexpr int kVectorBytes = 32;
 constexpr int kVectorBytes = 16;
 #endif
 
+#if defined(__AVX512F__) || defined(__aarch64__)
+constexpr int kRegisters = 32;
+#else
+constexpr int kRegisters = 16;
+#endif
+
 template <typename Real>
 struct Simd {
   static constexpr int kLanes = kVectorBytes / int(sizeof(Real));
