@@ -127,7 +127,7 @@ class BaseSimulator(ABC, Generic[W, R]):
         """Make the world of a scene, with the robot's joints (J,) at their start."""
 
     @abstractmethod
-    def _make_renderer(self, robot: tuple[Visual, ...], scene: Scene) -> R:
+    def _make_renderer(self, robot: tuple[Visual, ...], scene: Scene, *, shadows: bool) -> R:
         """Make a renderer of the robot, in some of its meshes, and of a scene."""
 
     @abstractmethod
@@ -220,10 +220,12 @@ class BaseSimulator(ABC, Generic[W, R]):
         return eye.colours(self._look(crop, width, height))
 
     def outside_picture(self, width: int, height: int) -> Image:
-        """Colour picture (height, width, 3) uint8 of the scene from outside, full meshes."""
+        """Colour picture (height, width, 3) uint8 of the scene from outside: full meshes, shadows."""
         if self._outside_renderer is None:
             robot = self._model.seen_from_outside
-            self._outside_renderer = self._make_renderer(robot, furnished(self._scene))
+            self._outside_renderer = self._make_renderer(
+                robot, furnished(self._scene), shadows=True
+            )
         self._outside_renderer.place(self._world.poses(), self._step)
         factor = eye.OUTSIDE_SUPERSAMPLING
         focal = eye.outside_focal_lengths(factor * height)
@@ -255,7 +257,9 @@ class BaseSimulator(ABC, Generic[W, R]):
     def _look(self, crop: Crop, width: int, height: int) -> Image:
         """Rendered picture (height, width, 4) of the left eye's crop; see `actors.backends.eye`."""
         if self._eye_renderer is None:
-            self._eye_renderer = self._make_renderer(self._model.seen_by_eye, self._scene)
+            self._eye_renderer = self._make_renderer(
+                self._model.seen_by_eye, self._scene, shadows=False
+            )
         poses = self._world.poses()
         self._eye_renderer.place(poses, self._step)
         focal = eye.eye_focal_lengths(crop, width, height)

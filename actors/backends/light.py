@@ -1,4 +1,7 @@
-"""The light that every backend draws with; it never changes and casts no shadows.
+"""The light that every backend draws with; it never changes.
+
+In the picture from outside the sun casts shadows. In the eye's pictures, which the network sees,
+nothing does.
 
 A surface whose normal is n (unit vector, world frame) and whose colour is c (linear, 0..1) is seen
 in the sRGB colour (brightness(n) * c) ** (1 / GAMMA).
@@ -22,6 +25,13 @@ GROUND: Final = 0.35
 """Brightness of a surface that faces downwards, without the sun."""
 GAMMA: Final = 2.2
 """Exponent that turns linear colours into those of a picture."""
+
+SHADOWS_CENTRE_M: Final = (0.0, 0.0, 0.0)
+"""Shadows fall within a sphere around this point (world frame)."""
+SHADOWS_RADIUS_M: Final = 2.3
+"""Radius of this sphere."""
+SHADOW_MAP_SIZE: Final = 2048
+"""Pixels along each side of the picture of what the sun sees."""
 
 
 def brightness(normals: Array) -> Array:

@@ -38,7 +38,6 @@ SCREEN_RED: Final = 16
 
 _SCREEN: Final = "screen"
 _UNUSED_FLAGS: Final = (
-    mujoco.mjtRndFlag.mjRND_SHADOW,
     mujoco.mjtRndFlag.mjRND_REFLECTION,
     mujoco.mjtRndFlag.mjRND_SKYBOX,
     mujoco.mjtRndFlag.mjRND_FOG,
@@ -51,18 +50,22 @@ _open: weakref.WeakSet[Renderer] = weakref.WeakSet()
 class Renderer:
     """The robot in one set of meshes, boxes and screen, in the light of `actors.backends.light`."""
 
-    def __init__(self, robot: Sequence[Visual], scene: Scene, driver: str) -> None:
+    def __init__(
+        self, robot: Sequence[Visual], scene: Scene, driver: str, *, shadows: bool
+    ) -> None:
         """Load the robot's meshes into the graphics driver.
 
         Args:
             robot: the robot's meshes.
             scene: the first scene.
             driver: the driver, see `graphics.find_driver`.
+            shadows: whether the sun casts shadows.
         """
+        self._shadows = shadows
         self._colours = sorted({visual.colour for visual in robot})
         self._frame_shape = _frame_shape(scene.screen)
         self._screen_size = None if scene.screen is None else scene.screen.size_m
-        self._model = _compile(robot, self._colours, scene.screen)
+        self._model = _compile(robot, self._colours, scene.screen, shadows=shadows)
         self._data = mujoco.MjData(self._model)
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)  # the light never changes
@@ -102,6 +105,7 @@ class Renderer:
         self._drawn = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + len(scene.boxes))
         for flag in _UNUSED_FLAGS:
             self._drawn.flags[flag] = 0
+        self._drawn.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = self._shadows
 
     def place(self, poses: Bodies, step: int) -> None:
         """Move every body to its pose, and show the screen's frame of a control step."""
@@ -190,10 +194,12 @@ def _frame_shape(screen: Screen | None) -> tuple[int, ...] | None:
     return None if screen is None else screen.frames.shape[1:]
 
 
-def _compile(robot: Sequence[Visual], colours: list[Colour], screen: Screen | None) -> Any:
+def _compile(
+    robot: Sequence[Visual], colours: list[Colour], screen: Screen | None, *, shadows: bool
+) -> Any:
     """A model with a body for each link that is drawn, and one for the screen."""
     spec = mujoco.MjSpec()
-    _add_light(spec)
+    _add_light(spec, shadows=shadows)
     spec.visual.quality.offsamples = 0  # blended codes would be the codes of other colours
     bodies: dict[str, Any] = {}
     for number, visual in enumerate(robot):
@@ -276,20 +282,25 @@ def _table_of(palette: tuple[Colour, ...]) -> NDArray[np.uint32]:
     return seen.view(np.uint32)[..., 0]
 
 
-def _add_light(spec: Any) -> None:
+def _add_light(spec: Any, *, shadows: bool) -> None:
     """The light of `actors.backends.light`, as the sum of an even light and three directions."""
     even, slope = (light.SKY + light.GROUND) / 2, (light.SKY - light.GROUND) / 2
     spec.visual.headlight.active = 0
+    # The even light is not the sun's: a shadow takes away all light of the source that casts it.
     for towards, diffuse, ambient in (
-        (light.TO_SUN, light.SUN, even),
-        ((0.0, 0.0, 1.0), slope, 0.0),
+        (light.TO_SUN, light.SUN, 0.0),
+        ((0.0, 0.0, 1.0), slope, even),
         ((0.0, 0.0, -1.0), -slope, 0.0),  # what faces down gets darker
     ):
         spec.worldbody.add_light(
             type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+            pos=light.SHADOWS_CENTRE_M + light.SHADOWS_RADIUS_M * np.array(towards),
             dir=-np.array(towards),
             ambient=[ambient] * 3,
             diffuse=[diffuse] * 3,
             specular=[0.0] * 3,
-            castshadow=False,
+            castshadow=shadows and towards == light.TO_SUN,
         )
+    spec.visual.quality.shadowsize = light.SHADOW_MAP_SIZE if shadows else 0
+    spec.visual.map.shadowclip = light.SHADOWS_RADIUS_M
+    spec.stat.extent = 1.0  # the unit of `shadowclip`

@@ -46,8 +46,10 @@ class MujocoSimulator(BaseSimulator[World, Renderer]):
     def _make_world(self, scene: Scene, start_rad: Array) -> World:
         return World(self._builder, scene, start_rad)
 
-    def _make_renderer(self, robot: tuple[Visual, ...], scene: Scene) -> Renderer:
-        return Renderer(robot, scene, graphics.find_driver())
+    def _make_renderer(
+        self, robot: tuple[Visual, ...], scene: Scene, *, shadows: bool
+    ) -> Renderer:
+        return Renderer(robot, scene, graphics.find_driver(), shadows=shadows)
 
     def _renewed(self, renderer: Renderer, scene: Scene) -> Renderer | None:
         if renderer.fits(scene):

@@ -28,7 +28,7 @@ def main() -> None:
 
 def _render(system: render.RenderSystem) -> None:
     scene = sapien.Scene([system])
-    camera = render.RenderCameraComponent(8, 6, str(Path(__file__).parent / "shader"))
+    camera = render.RenderCameraComponent(8, 6, str(Path(__file__).parent / "shader" / "eye"))
     entity = sapien.Entity()
     entity.add_component(camera)
     scene.add_entity(entity)

@@ -16,11 +16,12 @@ import numpy as np
 import sapien
 from sapien import render
 
+from actors.backends import light
 from actors.backends.eye import FAR_M, NEAR_M
 from actors.simulator import Box, Image, Scene, Screen
 from sim_assets.built_visuals import Visual
 
-SHADER: Final = Path(__file__).parent / "shader"
+SHADERS: Final = Path(__file__).parent / "shader"
 
 
 @dataclass
@@ -49,10 +50,13 @@ class _ShownScreen:
 class Renderer:
     """The robot in one set of meshes, boxes and screen, in the light of `actors.backends.light`."""
 
-    def __init__(self, robot: Iterable[Visual]) -> None:
+    def __init__(self, robot: Iterable[Visual], *, shadows: bool) -> None:
         render.set_picture_format("Color", "r8g8b8a8unorm")  # a quarter of the usual floats
         self._system = render.RenderSystem()
         self._scene = sapien.Scene([self._system])
+        self._shader = SHADERS / ("outside" if shadows else "eye")
+        if shadows:
+            self._scene.add_entity(_sun())
         shapes: dict[str, list[Any]] = {}
         for visual in robot:
             shapes.setdefault(visual.link, []).append(_mesh_shape(visual))
@@ -104,7 +108,7 @@ class Renderer:
     def _camera(self, width: int, height: int) -> Any:
         if (width, height) not in self._cameras:
             entity = sapien.Entity()
-            camera = render.RenderCameraComponent(width, height, str(SHADER))
+            camera = render.RenderCameraComponent(width, height, str(self._shader))
             entity.add_component(camera)
             self._scene.add_entity(entity)
             self._cameras[width, height] = camera
@@ -124,6 +128,21 @@ class Renderer:
         entity.add_component(body)
         self._scene.add_entity(entity)
         return entity
+
+
+def _sun() -> sapien.Entity:
+    """A light that tells the shader what the sun sees; its colour is the shader's own."""
+    sun = render.RenderDirectionalLightComponent()
+    sun.shadow = True
+    sun.shadow_half_size = light.SHADOWS_RADIUS_M
+    sun.shadow_near, sun.shadow_far = -light.SHADOWS_RADIUS_M, light.SHADOWS_RADIUS_M
+    sun.shadow_map_size = light.SHADOW_MAP_SIZE
+    entity = sapien.Entity()
+    entity.add_component(sun)
+    from_sun = -np.array(light.TO_SUN)
+    turn = sapien.math.shortest_rotation([1.0, 0.0, 0.0], from_sun)
+    entity.set_pose(sapien.Pose(light.SHADOWS_CENTRE_M, turn))
+    return entity
 
 
 def _box_shape(box: Box) -> Any:

@@ -139,7 +139,7 @@ def test_without_rendering_no_graphics_driver_is_needed():
 
 
 def test_the_shader_has_the_shared_light():
-    text = (Path(renderer.__file__).parent / "shader" / "gbuffer.frag").read_text()
+    text = (Path(renderer.__file__).parent / "shader" / "common" / "surface.glsl").read_text()
     towards = re.search(r"const vec3 TO_SUN = vec3\((.*)\);", text)
     numbers = dict(re.findall(r"const float (\w+) = (.*);", text))
     assert tuple(map(float, towards[1].split(","))) == light.TO_SUN

@@ -1,24 +1,8 @@
 #version 450
 // Transforms the vertices of one shape. SAPIEN binds its buffers by these declarations.
 
-layout(set = 0, binding = 0) uniform CameraBuffer {
-  mat4 viewMatrix;
-  mat4 projectionMatrix;
-  mat4 viewMatrixInverse;
-  mat4 projectionMatrixInverse;
-  float width;
-  float height;
-} camera;
-
-layout(set = 1, binding = 0) uniform ObjectTransformBuffer {
-  mat4 modelMatrix;
-} object;
-
-layout(set = 1, binding = 1) uniform ObjectDataBuffer {
-  uvec4 segmentation;
-  float transparency;
-  int shadeFlat;
-} objectData;
+#include "../common/camera.glsl"
+#include "../common/object.glsl"
 
 layout(location = 0) in vec3 position;
 layout(location = 1) in vec3 normal;

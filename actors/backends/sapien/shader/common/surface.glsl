@@ -1,5 +1,4 @@
-#version 450
-// Matt surfaces in the light of actors/backends/light.py, without shadows.
+// Matt surfaces in the light of actors/backends/light.py.
 // SAPIEN's own shaders take seconds to compile, and twice as long to draw.
 
 layout(set = 2, binding = 0) uniform MaterialBuffer {
@@ -35,10 +34,6 @@ layout(set = 3, binding = 0) uniform SceneBuffer {
   SpotLight texturedLights[1];
 } scene;
 
-layout(location = 0) in vec3 worldNormal;
-layout(location = 1) in vec2 textureUV;
-layout(location = 0) out vec4 outColor;
-
 const vec3 TO_SUN = vec3(-0.26, -0.43, 0.865);
 const float SUN = 0.4;
 const float SKY = 0.55;
@@ -47,12 +42,15 @@ const float GAMMA = 2.2;
 
 const int HAS_EMISSION_TEXTURE = 16;  // bit of textureMask
 
-void main() {
-  if ((material.textureMask & HAS_EMISSION_TEXTURE) != 0) {  // a screen glows by itself
-    outColor = vec4(texture(emissionTexture, textureUV).rrr, 1.0);
-    return;
-  }
-  vec3 normal = normalize(worldNormal);
-  float light = mix(GROUND, SKY, 0.5 + 0.5 * normal.z) + SUN * max(dot(normal, TO_SUN), 0.0);
-  outColor = vec4(pow(light * material.baseColor.rgb, vec3(1.0 / GAMMA)), 1.0);
+bool isScreen() { return (material.textureMask & HAS_EMISSION_TEXTURE) != 0; }
+
+// A screen glows by itself.
+vec4 screenColor(vec2 uv) { return vec4(texture(emissionTexture, uv).rrr, 1.0); }
+
+float skylight(vec3 normal) { return mix(GROUND, SKY, 0.5 + 0.5 * normal.z); }
+
+float sunlight(vec3 normal) { return SUN * max(dot(normal, TO_SUN), 0.0); }
+
+vec4 litColor(float light) {
+  return vec4(pow(light * material.baseColor.rgb, vec3(1.0 / GAMMA)), 1.0);
 }
