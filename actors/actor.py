@@ -7,6 +7,7 @@ import secrets
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,6 +45,7 @@ from proto.messages import (
     EYE_SIZE,
     LIVE_SCENE_EVERY,
     OUTSIDE_SIZE,
+    POLICIES_KEPT,
     Correction,
     EpisodeFailed,
     EpisodeOutcome,
@@ -77,8 +79,6 @@ OUTBOX_LIMIT: Final = 100
 """An actor plays no more for a receiver that owes it so many receipts."""
 REPORT_WITHIN_S: Final = 15.0
 """How long an actor waits at its start for receipts of reports that its predecessor died."""
-POLICIES_KEPT: Final = 32
-"""An actor keeps so many policies that are newer than the one it acts with."""
 UNSERVED_S: Final = 30.0
 """How often to say that the run has neither a learner nor an evaluator."""
 COMPARE_AGAIN_S: Final = 5.0
@@ -153,6 +153,20 @@ def live_message(actor: str, assignment: Assignment, live: LiveStep) -> Live:
 def _live_scene(live: LiveStep) -> LiveScene:
     view = view_of(live.scene, [])
     return LiveScene(tuple(live.bodies.places), view.boxes, view.fixed_links)
+
+
+def _earlier_policy(older: Mapping[int, Checkpoint], version: int) -> NetworkPolicy:
+    """An earlier version of the policy.
+
+    Raises:
+        UserError: it is none of those that the actor has, or it cannot act.
+    """
+    if version not in older:
+        raise UserError(f"this actor does not have policy {version}")
+    try:
+        return NetworkPolicy(older[version], "the policy")
+    except (ValueError, MemoryError) as error:
+        raise UserError(f"policy {version} cannot be used: {error}") from error
 
 
 class _StoppedError(Exception):
@@ -231,6 +245,8 @@ class Actor:
         # With first trials every version; otherwise only the newest.
         kept = POLICIES_KEPT if config.evaluator.first_trials else 1
         self._offers: deque[_Offer] = deque(maxlen=kept)  # newer than the policy, oldest first
+        # Of one training, oldest first: the evaluator may ask for trials of earlier versions.
+        self._known: deque[_Offer] = deque(maxlen=POLICIES_KEPT)
         self._offering = threading.Lock()
         self._pace = Pace()
         self._episodes = 0
@@ -475,14 +491,28 @@ class Actor:
         return self._tasks[name]
 
     def _trial(self) -> Assignment | None:
-        """A trial of this policy that the evaluator asks for; None if there is none."""
+        """A trial that the evaluator asks for; None if there is none.
+
+        It is one of this policy or, if all of the newest are played, of an earlier version.
+        """
         if self._policy is None or self._behind >= OUTBOX_LIMIT:
             return None
         version, digest = self._policy.version, self._agreement.digest
-        request = TrialRequest(self._bus.id, self._policy_run, version, digest, self._player)
+        with self._offering:
+            older = {
+                known.version: known.checkpoint
+                for known in self._known
+                if known.run_id == self._policy_run and known.version < version
+            }
+        request = TrialRequest(
+            self._bus.id, self._policy_run, version, digest, self._player, tuple(older)
+        )
         for trial in self._ask_evaluator.answers(request):
             try:
-                return self._rollout(Kind.TRIAL, self._policy, trial.seed, trial.conditions)
+                policy = self._policy
+                if trial.policy_version != version:
+                    policy = _earlier_policy(older, trial.policy_version)
+                return self._rollout(Kind.TRIAL, policy, trial.seed, trial.conditions)
             except UserError as error:
                 LOG.warning("the evaluator's trial cannot be played: %s", plain(error))
         return None
@@ -676,6 +706,9 @@ class Actor:
                 if waiting is not None and offered.run_id != waiting.run_id:
                     self._offers.clear()
                 self._offers.append(offered)
+                if self._known and self._known[-1].run_id != offered.run_id:
+                    self._known.clear()
+                self._known.append(offered)
 
     def _first_trial(self) -> Assignment | None:
         """Take the newer policies, one after the other, until there is no newer one.

@@ -50,6 +50,8 @@ POLICY_LIMIT: Final = 130 * MEBIBYTE
 """Size of the largest possible network; in a run its own network sets the limit (bytes)."""
 
 Count = Annotated[int, Integer(0, 2**31)]
+POLICIES_KEPT: Final = 32
+"""An actor keeps so many policies at most, beside the one that it acts with."""
 LARGEST_VERSION: Final = 10**6
 """Largest version of a policy. Each version takes an epoch of training at least."""
 Seed = Annotated[int, Integer(0, 2**63 - 1)]
@@ -303,28 +305,35 @@ class Verdict:
     conditions: ConditionsField = None
 
 
-@message("trial_request", 2)
+@message("trial_request", 3)
 @dataclass(frozen=True)
 class TrialRequest:
-    """An actor's request for a trial of its policy; fields as in `TutoringRequest`."""
+    """An actor's request for a trial; other fields as in `TutoringRequest`.
+
+    Attributes:
+        older: earlier versions of this training that the actor can still act with.
+    """
 
     actor: Id
     run_id: Id
     policy_version: Count
     config_digest: Annotated[str, Text(64)]
     player: Player
+    older: Annotated[tuple[int, ...], Many(Integer(0, 2**31), Size("older", 0, POLICIES_KEPT))] = ()
 
 
-@message("trial", 1)
+@message("trial", 2)
 @dataclass(frozen=True)
 class Trial:
-    """A trial to play with the policy version of the request.
+    """A trial to play.
 
     Attributes:
+        policy_version: which of the versions of the request shall act.
         seed: seed of the situation and of the episode.
         conditions: as in `Episode`.
     """
 
+    policy_version: Count
     seed: Seed
     conditions: ConditionsField = None
 

@@ -134,7 +134,11 @@ def _rows() -> Iterator[Row]:
     yield _row(keys.pictures(ACTOR_ID), (actor, (put,)), (_LOOKERS, (subscribe,)))
     for role in _MEMBERS:
         name = ACTOR_ID if role is Role.ACTOR else _ID
-        yield _row(keys.metrics(role, name), (HOLDER_OF[role], (put, subscribe)))
+        # The evaluator listens whether the learner needs practice.
+        listeners = (evaluator,) if role is Role.LEARNER else ()
+        yield _row(
+            keys.metrics(role, name), (HOLDER_OF[role], (put, subscribe)), (listeners, (subscribe,))
+        )
     # A subscription must be within the key of one row, so the wildcard has a row of its own.
     yield _row(keys.metrics(), ((*_LOOKERS, recorder), (subscribe,)))
     for role in _MEMBERS:

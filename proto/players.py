@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Final
 
 from proto.suites import Player
@@ -36,6 +36,11 @@ class Players:
         with self._lock:
             if self._players.get(actor) != player:
                 self._set(actor, player)
+
+    def all_among(self, actors: Collection[str]) -> bool:
+        """Whether there is an actor, and every present actor is among some."""
+        with self._lock:
+            return bool(self._players) and all(actor in actors for actor in self._players)
 
     def lack(self, can_play: Callable[[Player], bool]) -> bool:
         """Whether something cannot be played by any actor, and none is expected that can.

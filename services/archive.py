@@ -17,6 +17,9 @@ from proto.errors import UserError
 from proto.plain_text import plain
 from proto.recordings.episodes import EpisodeHeading, read_heading
 from proto.senders import is_id
+from services.board import Loss
+from services.monitoring.history import history_file
+from services.monitoring.past_losses import PastLosses
 
 LOG = logging.getLogger(__name__)
 
@@ -92,6 +95,7 @@ class RunArchive:
         self._recordings: deque[Recording] = deque(maxlen=RECORDINGS_KEPT)
         self._paths: dict[str, Path] = {}
         self._losses: dict[Path, tuple[int, int, float] | None] = {}
+        self._past = PastLosses(history_file(folder))
         self._found = 0
 
     @property
@@ -100,7 +104,8 @@ class RunArchive:
         return self.folder.is_dir()
 
     def look(self) -> None:
-        """Find new recordings, the oldest first; each call reads a limited number of them."""
+        """Find new recordings, the oldest first, and losses; each call reads a limited number."""
+        self._past.look()
         present = {path for name in FOLDERS for path in (self.folder / name).glob("*.mcap")}
         self._known &= present
         for path in sorted(present - self._known, key=_written_at_ns)[:_READ_AT_ONCE]:
@@ -132,6 +137,10 @@ class RunArchive:
     def newest_policy(self) -> Path | None:
         """The file of the newest policy; None if there is none."""
         return max((self.folder / "policies").glob("*.safetensors"), default=None)
+
+    def past_losses(self) -> Sequence[Loss]:
+        """The losses of the newest training that the run's history has so far."""
+        return self._past.losses()
 
     def policy_losses(self) -> Sequence[tuple[int, int, float]]:
         """Version, epoch and loss of each policy, the oldest first."""

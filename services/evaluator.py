@@ -34,7 +34,7 @@ from proto.messages import (
     TrialRequest,
     Verdict,
 )
-from proto.metrics import EvaluatorMetrics, PolicyScore, Success, SuiteScore
+from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore, Stage, Success, SuiteScore
 from proto.plain_text import plain
 from proto.players import Players
 from proto.situations import situation_of
@@ -57,6 +57,8 @@ IDLE_S: Final = 0.5
 """How often to look whether it should stop, while no outcome arrives."""
 VERSIONS_TOLD: Final = 500
 """The metrics have the scores of so many of the newest versions; the log has all."""
+VERSIONS_NAMED: Final = 20
+"""The log names so many versions in one line."""
 REASONS_TOLD: Final = 31
 """The metrics name so many reasons of a version; the others are summed up."""
 
@@ -68,6 +70,8 @@ class Evaluator:
     """Tries every policy version in the same suites, and counts each trial once.
 
     It hands out the trials of the first suite first, and to each actor only what it can play.
+    When all trials of the newest version are handed out, and the learner needs no practice, it
+    catches up on versions that were followed too soon by a newer one.
     """
 
     def __init__(self, config: Config, bus: Bus, lifecycle: Lifecycle, *, task: Task) -> None:
@@ -93,6 +97,9 @@ class Evaluator:
         self._practised = {suite.name: suite for suite in config.practised_suites()}
         self._players = Players()
         self._unplayable: dict[str, str] = {}
+        self._stage: Stage | None = None  # of the learner
+        self._held: dict[str, tuple[int, ...]] = {}  # older versions that each actor can act with
+        self._not_held: set[PolicyKey] = set()  # of which the log says that no actor has them
         self._failures: Failures[TrialKey] = Failures()
         self._taken: list[EpisodeOutcome] = []  # to be counted and answered
         self._task = task
@@ -126,6 +133,7 @@ class Evaluator:
             limit=policy_limit(self._config.network),
         )
         self._bus.answer(keys.request_trial, TrialRequest, self._hand_out)
+        self._bus.subscribe(keys.metrics(Role.LEARNER), self._on_learner, LearnerMetrics)
         self._bus.watch_presence(Role.ACTOR, self._on_presence)
         with membership(self._bus, self, self._lifecycle):
             look_at_s = 0.0
@@ -136,6 +144,7 @@ class Evaluator:
                     pass
                 if not came or time.monotonic() >= look_at_s:
                     self._look_for_players()
+                    self._look_for_holders()
                     look_at_s = time.monotonic() + IDLE_S
 
     def metrics(self) -> EvaluatorMetrics:
@@ -196,10 +205,14 @@ class Evaluator:
         if self._asked.publish((policy.run_id, policy.version)):
             LOG.info("policy %d is tried from now on", policy.version)
 
+    def _on_learner(self, metrics: LearnerMetrics) -> None:
+        self._stage = metrics.stage
+
     def _on_presence(self, actor: str, alive: bool) -> None:
         self._players.presence(actor, alive)
         if not alive:
             self._leases.release(actor)
+            self._held.pop(actor, None)
 
     def _hand_out(self, request: TrialRequest) -> Trial | None:
         newest = self._asked.newest
@@ -210,27 +223,52 @@ class Evaluator:
         policy = (request.run_id, request.policy_version)
         if self._lifecycle.paused or policy[0] != newest[0] or not 1 <= policy[1] <= newest[1]:
             return None
-        taken = self._leases.take(request.actor, self._wanted(policy, request.player))
+        if policy == newest:
+            self._held[request.actor] = request.older
+        else:  # it holds newer ones too, which it does not name
+            self._held.pop(request.actor, None)
+        taken = self._leases.take(request.actor, self._wanted(request, policy))
         if taken is None:
             return None
-        _, name, seed = taken
-        self._asked.give(policy, (name, seed), request.actor)
-        LOG.debug("policy %d: trial %d of %s goes to %s", policy[1], seed, name, request.actor)
-        return Trial(seed, self._suites[name].conditions(seed))
+        (_, version), name, seed = taken
+        self._asked.give(taken[0], (name, seed), request.actor)
+        LOG.debug("policy %d: trial %d of %s goes to %s", version, seed, name, request.actor)
+        return Trial(version, seed, self._suites[name].conditions(seed))
 
-    def _wanted(self, policy: PolicyKey, player: Player) -> Iterator[TrialKey]:
-        """The trials of a policy that are not counted yet and that a player can play."""
+    def _wanted(self, request: TrialRequest, policy: PolicyKey) -> Iterator[TrialKey]:
+        """The trials that an actor may play, the most important first."""
+        newest = self._asked.newest
+        first = None if policy == newest else self._config.evaluator.first_trials
+        yield from self._missing_of(policy, request.player, first)
+        if policy == newest and not self._practice_is_needed:
+            for version in sorted(request.older, reverse=True):
+                if 1 <= version < newest[1]:
+                    yield from self._missing_of((policy[0], version), request.player)
+
+    def _missing_of(
+        self, policy: PolicyKey, player: Player, first: int | None = None
+    ) -> Iterator[TrialKey]:
+        """The trials of a policy that are not counted yet and that a player can play.
+
+        Args:
+            policy: the policy.
+            player: the player.
+            first: only so many trials of each suite; None for all.
+        """
         for suite in self._suites.values():
-            for seed in self._missing(policy, suite):
+            for seed in self._missing(policy, suite, first):
                 if player.can_play(suite.backend, suite.conditions(seed)):
                     yield policy, suite.name, seed
 
-    def _missing(self, policy: PolicyKey, suite: Suite) -> list[int]:
-        """The trials that a policy still gets: all of the newest, the first ones of another."""
-        first = self._config.evaluator.first_trials
-        seeds = suite.test_seeds if policy == self._asked.newest else suite.test_seeds[:first]
+    def _missing(self, policy: PolicyKey, suite: Suite, first: int | None = None) -> list[int]:
+        """The first trials of a suite, or all, that are not counted yet."""
         counted = self._counted(policy, suite)
-        return [seed for seed in seeds if seed not in counted]
+        return [seed for seed in suite.test_seeds[:first] if seed not in counted]
+
+    @property
+    def _practice_is_needed(self) -> bool:
+        """Whether the learner waits for what comes of practice: failures to be corrected."""
+        return self._stage is Stage.WAITING
 
     def _look_for_players(self) -> None:
         """Note, and log once, which suites have trials that no present actor can play."""
@@ -254,6 +292,35 @@ class Evaluator:
             if self._players.lack(partial(_can_be_disturbed, suite.backend, ability)):
                 return f"no actor with {suite.backend} can play the disturbance {name}"
         return ""
+
+    def _look_for_holders(self) -> None:
+        """Log, once, which earlier versions lack trials that no present actor can play."""
+        run_id, newest = self._asked.newest
+        held = dict(self._held)
+        if self._practice_is_needed or not self._players.all_among(held):
+            return
+        if any(self._lacking(run_id, newest)):
+            return
+        told = range(max(1, newest - VERSIONS_TOLD), newest)
+        versions = set(told).difference(*held.values())
+        lacking = [
+            version
+            for version in sorted(versions)
+            if (run_id, version) not in self._not_held and any(self._lacking(run_id, version))
+        ]
+        if not lacking:
+            return
+        self._not_held.update((run_id, version) for version in lacking)
+        LOG.warning(
+            "no actor has %s any more, so the rest of their trials is not played;"
+            " `vmdnn evaluate --run %s --policy-version all` plays it",
+            *(_versions_words(lacking), self._config.run_folder),
+        )
+
+    def _lacking(self, run_id: str, version: int) -> Iterator[int]:
+        """How many trials of each suite a version lacks."""
+        for suite in self._suites.values():
+            yield len(self._missing((run_id, version), suite))
 
     def _receive(self, inbox: Inbox[EpisodeOutcome]) -> bool:
         """Handle the outcomes that have arrived; False if none arrives for some time.
@@ -321,8 +388,11 @@ class Evaluator:
         _, version = newest = self._asked.newest
         if not version:
             return "a policy"
-        left = sum(len(self._missing(newest, suite)) for suite in self._suites.values())
-        return f"{left} trials of policy {version}" if left else "the next policy"
+        if left := sum(self._lacking(*newest)):
+            return f"{left} trials of policy {version}"
+        if being_played := len(self._leases):
+            return f"{being_played} trials of earlier policies"
+        return "the next policy"
 
     def _refusal(self, played: EpisodeOutcome | EpisodeFailed) -> str:
         """Why an episode is no trial and no practice of this run; empty if it is one.
@@ -386,6 +456,13 @@ class Evaluator:
     def _counted(self, policy: PolicyKey, suite: Suite) -> Mapping[int, Outcome]:
         outcomes = self._log.outcomes(*policy, suite.name)
         return {seed: outcome for seed, outcome in outcomes.items() if seed in suite.test_seeds}
+
+
+def _versions_words(versions: list[int]) -> str:
+    """Such as `policy 3`, or `policies 1, 2 and 5 more`."""
+    named, more = versions[:VERSIONS_NAMED], len(versions) - VERSIONS_NAMED
+    words = ", ".join(map(str, named)) + (f" and {more} more" if more > 0 else "")
+    return f"policy {words}" if len(versions) == 1 else f"the policies {words}"
 
 
 def _report_trial(played: EpisodeOutcome | EpisodeFailed, result: str) -> None:

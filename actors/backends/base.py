@@ -220,7 +220,7 @@ class BaseSimulator(ABC, Generic[W, R]):
         return eye.colours(self._look(crop, width, height))
 
     def outside_picture(self, width: int, height: int) -> Image:
-        """Colour picture (height, width, 3) uint8 of the scene from outside: full meshes, shadows."""
+        """Colour picture (height, width, 3) uint8 from outside: full meshes, with shadows."""
         if self._outside_renderer is None:
             robot = self._model.seen_from_outside
             self._outside_renderer = self._make_renderer(

@@ -119,10 +119,19 @@ def suites_content(view: RunView) -> Mapping[str, Any]:
 
 
 def losses_content(board: Board | None, archive: RunArchive) -> Mapping[str, Any]:
-    """The losses that were heard, and those that the run's policies tell of."""
+    """The losses of the run's history with those heard since, and those of its policies."""
+    past = archive.past_losses()
     heard = [] if board is None else board.losses
+    if past:  # what the history has too is left out
+        last = past[-1]
+        known = [
+            number
+            for number, each in enumerate(heard, 1)
+            if each.stage == last.stage and each.epoch <= last.epoch
+        ]
+        heard = heard[max(known, default=0) :]
     return {
-        "losses": [[each.stage, each.epoch, _short(each.loss)] for each in heard],
+        "losses": [[each.stage, each.epoch, _short(each.loss)] for each in (*past, *heard)],
         "policies": [
             [version, epoch, _short(loss)] for version, epoch, loss in archive.policy_losses()
         ],

@@ -85,6 +85,7 @@ class ActorSetup:
         self.requests: list[TutoringRequest] = []
         self.trials: list[Trial] = []
         self.first_trials: dict[int, list[Trial]] = {}
+        self.trial_requests: list[TrialRequest] = []
         self.sequences: list[Episode] = []
         self.rollouts: list[Rollout] = []
         self.outcomes: list[EpisodeOutcome] = []
@@ -148,6 +149,7 @@ class ActorSetup:
         return self._next(self.cases)
 
     def _on_trial_request(self, request: TrialRequest) -> object | None:
+        self.trial_requests.append(request)
         return self._next(self.first_trials.get(request.policy_version, self.trials))
 
     def _next(self, things: list[Any]) -> object | None:
@@ -216,7 +218,7 @@ def test_it_demonstrates_cases_plays_trials_and_practises(
     assert metrics.last_kind is Kind.TUTORING
     assert metrics.last_outcome == reaching.outcome.reason
 
-    setup.trials.append(Trial(seed=1234))
+    setup.trials.append(Trial(1, 1234))
     setup.publish(policy(1))
     eventually(lambda: len(setup.rollouts) >= 2, "a trial, then practice")
     trial, practice = setup.rollouts[:2]
@@ -386,7 +388,7 @@ def test_first_trials_of_each_policy_come_before_a_newer_one(
     setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     setup.cases.append(TutoringCase("experiment1", 5, 0))
-    setup.first_trials = {1: [Trial(70), Trial(71)], 2: [], 3: [Trial(70)]}
+    setup.first_trials = {1: [Trial(1, 70), Trial(1, 71)], 2: [], 3: [Trial(3, 70)]}
     setup.start_actor("--set", "evaluator.first_trials=2", "--set", "actor.practice=false")
     eventually(lambda: bool(setup.lives), "a demonstration is going on")
     for version in (1, 2, 3, 4):
@@ -395,6 +397,29 @@ def test_first_trials_of_each_policy_come_before_a_newer_one(
     eventually(lambda: len(setup.rollouts) == 3, "all trials are played")
     played = [(r.episode.policy_version, r.episode.seed) for r in setup.rollouts]
     assert played == [(1, 70), (1, 71), (3, 70)]
+
+
+def test_it_plays_trials_of_earlier_policies_that_it_has_passed_over(
+    setup: ActorSetup, policy: Callable[..., PolicyVersion]
+) -> None:
+    setup.cases.append(TutoringCase("experiment1", 5, 0))
+    setup.start_actor("--set", "actor.practice=false")
+    eventually(lambda: bool(setup.lives), "a demonstration is going on")
+    for version in (1, 2, 3):
+        setup.publish(policy(version))
+    setup.wait_for_metrics(lambda metrics: metrics.policy_version == 3)
+    eventually(lambda: bool(setup.trial_requests), "it asks for a trial")
+    asked = setup.trial_requests[-1]
+    assert (asked.policy_version, asked.older) == (3, (1, 2))
+    setup.trials += [Trial(2, 70), Trial(9, 71), Trial(1, 72), Trial(3, 73)]
+    eventually(lambda: len(setup.rollouts) == 3, "all trials of policies that it has are played")
+    played = [(r.episode.policy_version, r.episode.seed) for r in setup.rollouts]
+    assert played == [(2, 70), (1, 72), (3, 73)]
+    assert "this actor does not have policy 9" in setup.log.read_text()
+    setup.publish(policy(1, run_id="new-training"))
+    setup.wait_for_metrics(lambda metrics: metrics.policy_version == 1)
+    eventually(lambda: setup.trial_requests[-1].run_id == "new-training", "it asks again")
+    assert setup.trial_requests[-1].older == ()
 
 
 def test_a_refused_message_is_put_aside_and_delays_no_others(setup: ActorSetup) -> None:
@@ -448,7 +473,7 @@ def test_a_failed_simulation_is_reported_to_learner_and_evaluator(
     setup.publish(policy(4))
     eventually(lambda: setup.holds("training", 4), "it holds it")
     setup.cases.append(Correction("experiment1", 3, situation))
-    setup.trials.append(Trial(80, Conditions("noisy", 1.0, "noisy", 9.0)))
+    setup.trials.append(Trial(4, 80, Conditions("noisy", 1.0, "noisy", 9.0)))
     eventually(lambda: len(setup.failures) == 3, "a correction and a trial fail")
     by_kind = {report.kind: report for report in setup.failures}
     assert by_kind[Kind.CORRECTION].seed == 3
@@ -475,7 +500,7 @@ def test_an_episode_that_kills_the_actor_is_reported_by_the_next_one(
     setup.start_actor(*words, "--set", "actor.practice=false")
     eventually(lambda: len(setup.failures) == 1, "the case is reported")
     eventually(lambda: setup.holds("training", 4), "it holds the policy")
-    setup.trials.append(Trial(DEADLY_SEED))
+    setup.trials.append(Trial(4, DEADLY_SEED))
     setup.actor.wait(PATIENCE_S)
     setup.start_actor(*words)
     eventually(lambda: len(setup.failures) == 2, "the trial is reported")
@@ -494,7 +519,7 @@ def test_it_plays_trials_and_practises_under_the_conditions_of_suites(
 ) -> None:
     conditions = Conditions("pushed", 1.0, "pushed", 20.0)
     unknown = Conditions("mine", 1.0, "darker", 20.0)
-    setup.trials += [Trial(500, conditions), Trial(501, unknown)]
+    setup.trials += [Trial(1, 500, conditions), Trial(1, 501, unknown)]
     setup.publish(policy(1))
     suites = "evaluator.suites=[{name: pushed, trials: 5}, {name: elsewhere, backend: other}]"
     corrections = "learner.corrections={rounds: 1, suites: [pushed, elsewhere]}"
@@ -629,7 +654,7 @@ def test_a_rollout_stays_until_the_recorder_has_it_too(
     setup: ActorSetup, policy: Callable[..., PolicyVersion]
 ) -> None:
     setup.recorders.clear()
-    setup.trials.append(Trial(seed=1234))
+    setup.trials.append(Trial(1, 1234))
     setup.publish(policy(1))
     setup.start_actor("--set", "actor.practice=false")
     eventually(lambda: len(setup.rollouts) == 1, "a trial")

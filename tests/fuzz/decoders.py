@@ -139,8 +139,8 @@ def _messages() -> list[object]:
         Receipt("e1", "no"),
         TutoringCase("experiment1", 3, 1),
         Verdict("ab12", 3, "experiment1", 7, episode.situation, outcome, "sapien"),
-        TrialRequest("actor", "ab12", 3, "c0ffee", player),
-        Trial(1000, episode.conditions),
+        TrialRequest("actor", "ab12", 3, "c0ffee", player, (1, 2)),
+        Trial(3, 1000, episode.conditions),
         Live(
             *("actor", Kind.TRIAL, "run", 3, 1, "lift", episode.images[0]),
             *(episode.joints_deg[0], episode.actions[0], episode.body_poses[0]),

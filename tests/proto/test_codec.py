@@ -58,7 +58,9 @@ CONDITIONS = st.one_of(
 MESSAGES = st.one_of(
     st.builds(Receipt, IDS),
     st.builds(TutoringCase, WORDS, COUNTS, COUNTS),
-    st.builds(TrialRequest, IDS, IDS, COUNTS, WORDS, PLAYERS),
+    st.builds(
+        TrialRequest, IDS, IDS, COUNTS, WORDS, PLAYERS, st.lists(COUNTS, max_size=32).map(tuple)
+    ),
     st.builds(Trial, st.integers(0, 2**63 - 1), CONDITIONS),
     st.builds(Control, st.sampled_from(Command)),
     st.builds(

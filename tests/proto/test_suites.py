@@ -148,8 +148,8 @@ def test_an_actor_is_asked_for_what_it_can_play() -> None:
 
 
 def test_impossible_conditions_are_refused_on_the_bus() -> None:
-    wire = encode(Trial(5, Conditions("pushed", 1.0, "pushed", 20.0)))
-    assert decode(wire, Trial) == Trial(5, Conditions("pushed", 1.0, "pushed", 20.0))
+    wire = encode(Trial(1, 5, Conditions("pushed", 1.0, "pushed", 20.0)))
+    assert decode(wire, Trial) == Trial(1, 5, Conditions("pushed", 1.0, "pushed", 20.0))
     for before, after in ((b"pushed\xa8", b"pushes\xa8"), (b"\xcb@4", b"\xcbA4")):
         assert before in wire.payload
         wrong = wire.payload.replace(before, after)

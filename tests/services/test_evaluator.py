@@ -14,6 +14,7 @@ from fitting import fitting_fields, make_policy, settings_digest, task_called
 from outcomes import NOT_LIFTED, PRECISE
 from ports import free_endpoint
 from processes import PATIENCE_S, eventually, listening_hub, run_vmdnn, stop, vmdnn
+from run_metrics import LEARNER
 
 from proto.bus import Bus, open_bus
 from proto.config import HubConfig
@@ -31,7 +32,7 @@ from proto.messages import (
     TrialRequest,
     Verdict,
 )
-from proto.metrics import EvaluatorMetrics
+from proto.metrics import EvaluatorMetrics, Stage
 from proto.suites import Conditions, Player
 from services.evaluator import _reasons
 from services.trials.success import Tally
@@ -48,6 +49,7 @@ class EvaluatorSetup:
         self._stack = stack
         self._make_episode = make_episode
         self.endpoint = free_endpoint()
+        self.log = folder / "evaluator.log"
         self.words = (
             *("--connect", self.endpoint, "--set", f"run.folder={folder}"),
             *("--set", "run.name=test", "--set", "evaluator.trials_per_policy=3"),
@@ -68,13 +70,20 @@ class EvaluatorSetup:
 
     def start(self, *more: str) -> Popen[bytes]:
         self.metrics = None
-        self.process = self._stack.enter_context(vmdnn("evaluator", *self.words, *more))
+        self.process = self._stack.enter_context(
+            vmdnn("evaluator", *self.words, *more, log=self.log)
+        )
         return self.process
 
     def restart(self, *more: str) -> None:
         self.process.kill()
         self.process.wait()
         self.start(*more)
+
+    def tell_stage(self, stage: Stage) -> None:
+        """Publish the learner's metrics in a stage."""
+        metrics = replace(LEARNER, id="learner", stage=stage)
+        self.learner.publish(self.learner.keys.metrics(Role.LEARNER, "learner"), metrics)
 
     def join(self, role: Role, name: str) -> Bus:
         bus = open_bus(HubConfig(endpoint=self.endpoint), "test", role, name)
@@ -87,12 +96,25 @@ class EvaluatorSetup:
     def ask(
         self, actor: Bus, version: int, run_id: str = "training", player: Player = SAPIEN
     ) -> list[int]:
-        request = TrialRequest(actor.id, run_id, version, settings_digest(), player)
+        given = self.ask_with_older(actor, version, (), run_id, player)
+        assert {asked for asked, _ in given} <= {version}
+        return [seed for _, seed in given]
+
+    def ask_with_older(
+        self,
+        actor: Bus,
+        version: int,
+        older: tuple[int, ...],
+        run_id: str = "training",
+        player: Player = SAPIEN,
+    ) -> list[tuple[int, int]]:
+        """Version and seed of the trial that an actor gets that also holds older versions."""
+        request = TrialRequest(actor.id, run_id, version, settings_digest(), player, older)
         key = actor.keys.request_trial
         given = actor.ask(
             key, request, Trial, timeout_s=PATIENCE_S
         )  # a late answer is a lost trial
-        return [trial.seed for trial in given]
+        return [(trial.policy_version, trial.seed) for trial in given]
 
     def ask_until_given(self, actor: Bus, version: int) -> int:
         seeds: list[int] = []
@@ -222,6 +244,50 @@ def test_each_policy_gets_its_first_trials_also_when_a_newer_one_is_there(
     assert setup.ask(actor, 1) == []
     metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 2})
     assert metrics.leases == 1
+
+
+def test_it_catches_up_on_earlier_policies_when_nothing_newer_waits(
+    setup: EvaluatorSetup,
+) -> None:
+    actor, other = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "b")
+    setup.publish(1)
+    assert setup.ask_until_given(actor, 1) == 70
+    setup.publish(3)  # version 2 never arrived here
+    assert setup.ask_until_given(actor, 3) == 70
+    assert setup.ask_with_older(actor, 3, (1, 2)) == [(3, 71)], "the newest comes first"
+    assert setup.ask_with_older(other, 3, (1, 2)) == [(3, 72)]
+    assert setup.ask_with_older(other, 3, (2,)) == [(2, 70)], "the later of the earlier ones"
+    assert setup.ask_with_older(other, 3, (1,)) == [(1, 71)], "70 is being played"
+    assert setup.ask_with_older(other, 3, (3, 4)) == [], "these are not earlier"
+    for seed, version in ((70, 1), (71, 1), (70, 2), (70, 3), (71, 3), (72, 3)):
+        setup.send(
+            other if (seed, version) in ((71, 1), (70, 2), (72, 3)) else actor, seed, version
+        )
+    setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 2, 2: 1, 3: 3})
+
+    setup.tell_stage(Stage.WAITING)  # the learner waits for failures in practice
+    eventually(lambda: not setup.ask_with_older(actor, 3, (2,)), "practice comes first")
+    setup.tell_stage(Stage.COUPLED)
+    eventually(lambda: setup.ask_with_older(other, 3, (1, 2)) != [], "it catches up again")
+    setup.wait_for_metrics(lambda metrics: metrics.waiting_for.endswith("of earlier policies"))
+
+
+def test_it_says_which_earlier_policies_no_actor_can_play_any_more(setup: EvaluatorSetup) -> None:
+    actor, other = setup.join(Role.ACTOR, "a"), setup.join(Role.ACTOR, "b")
+    for bus in (actor, other):
+        bus.announce()
+    setup.publish(4)
+    assert setup.ask_until_given(actor, 4) == 70
+    assert [*setup.ask(other, 4), *setup.ask(actor, 4)] == [71, 72]
+    for bus, seed in ((actor, 70), (other, 71), (actor, 72)):
+        setup.send(bus, seed, 4)
+    assert setup.ask_with_older(actor, 4, (3,)) == [(3, 70)]
+    assert setup.ask_with_older(other, 4, ()) == []
+    said = "no actor has the policies 1, 2 any more"
+    eventually(lambda: said in setup.log.read_text(), "it says so")
+    actor.close()
+    eventually(lambda: "no actor has policy 3 any more" in setup.log.read_text(), "it says so")
+    assert setup.log.read_text().count(said) == 1
 
 
 def test_nothing_counts_that_was_not_asked_for(setup: EvaluatorSetup) -> None:
@@ -420,7 +486,7 @@ def test_each_actor_gets_trials_of_the_suites_that_it_can_play(setup: EvaluatorS
         Trial,
         timeout_s=60.0,
     )
-    assert trial == Trial(500, trial.conditions)
+    assert trial == Trial(2, 500, trial.conditions)
     assert trial.conditions is not None
     assert (trial.conditions.suite, trial.conditions.disturbance) == ("pushed", "pushed")
     assert setup.ask(other, 2, player=foreign) == [600]

@@ -46,9 +46,7 @@ class MujocoSimulator(BaseSimulator[World, Renderer]):
     def _make_world(self, scene: Scene, start_rad: Array) -> World:
         return World(self._builder, scene, start_rad)
 
-    def _make_renderer(
-        self, robot: tuple[Visual, ...], scene: Scene, *, shadows: bool
-    ) -> Renderer:
+    def _make_renderer(self, robot: tuple[Visual, ...], scene: Scene, *, shadows: bool) -> Renderer:
         return Renderer(robot, scene, graphics.find_driver(), shadows=shadows)
 
     def _renewed(self, renderer: Renderer, scene: Scene) -> Renderer | None:

@@ -41,9 +41,7 @@ class SapienSimulator(BaseSimulator[World, Renderer]):
         period_s = self._config.physics_period_s
         return World(self._builder, self._model.joints, scene, start_rad, period_s)
 
-    def _make_renderer(
-        self, robot: tuple[Visual, ...], scene: Scene, *, shadows: bool
-    ) -> Renderer:
+    def _make_renderer(self, robot: tuple[Visual, ...], scene: Scene, *, shadows: bool) -> Renderer:
         renderer = Renderer(robot, shadows=shadows)
         renderer.set_scene(scene)
         return renderer

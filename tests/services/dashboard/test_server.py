@@ -22,9 +22,12 @@ from websockets.sync.client import ClientConnection, connect
 
 from proto.episode import Episode, Measure, Outcome
 from proto.messages import Command
+from proto.metrics import EpochMetrics
 from proto.periodic import every
 from proto.recordings.episodes import write_episode
 from services.cli import main
+from services.monitoring.history import History, history_file
+from services.monitoring.sample import LearnerSample, Sample
 
 
 class Browser:
@@ -89,6 +92,33 @@ def test_a_browser_is_told_what_happens(staged: StagedRun, episodes: list[Episod
             eventually(lambda: not staged.watched("a-1"), "nobody looks at it any more")
         staged.leave("a-1")
         browser.hear(lambda: browser.process("a-1").get("gone_s") is not None)
+
+
+def test_a_page_that_is_opened_late_shows_the_loss_from_the_beginning(
+    staged: StagedRun, episodes: list[Episode]
+) -> None:
+    history = History(history_file(staged.config.run_folder), period_s=1.0)
+    stage = LEARNER.stage
+    for epoch in range(1, LEARNER.epoch + 3):  # the learner told the last ones again, live
+        told = EpochMetrics(stage=stage, epoch=epoch, loss=1.0, learning_rate=0.1)
+        learner = LearnerSample(
+            **{"training": LEARNER.training, "stage": stage, "round": 0, "epochs": (told,)},
+            **{"epochs_per_s": 1.0, "sequences": 3, "policy_version": 0},
+        )
+        history.add(Sample(time_s=float(epoch), learner=learner))
+    history.flush()
+    told_now = Told(staged, episodes[1])
+    with dashboard(staged.config) as address, browsing(address) as connection:
+        browser = Browser(connection)
+
+        def epochs() -> list[int]:
+            losses = browser.newest.get("losses", {}).get("losses", [])
+            return [epoch for _, epoch, _ in losses]
+
+        with every(0.1, told_now.once):
+            browser.hear(lambda: epochs()[-1:] > [LEARNER.epoch + 4])
+        assert epochs()[: LEARNER.epoch] == list(range(1, LEARNER.epoch + 1))
+        assert epochs() == sorted(set(epochs())), "none twice"
 
 
 def test_texts_from_outside_arrive_as_texts(staged: StagedRun) -> None:
