@@ -390,8 +390,8 @@ class Evaluator:
             return "a policy"
         if left := sum(self._lacking(*newest)):
             return f"{left} trials of policy {version}"
-        if being_played := len(self._leases):
-            return f"{being_played} trials of earlier policies"
+        if len(self._leases):
+            return "trials of earlier policies"
         return "the next policy"
 
     def _refusal(self, played: EpisodeOutcome | EpisodeFailed) -> str:

@@ -80,6 +80,11 @@ _EVERY_PROCESS: Final = (
         "1 while the process waits for a disk that is full or cannot be written.",
         lambda m: m.waiting_for.startswith("the disk"),
     ),
+    _Field(
+        "process_certificate_expires_days",
+        "Days until the certificate of the process expires; left out before the last 30.",
+        lambda m: m.certificate_days,
+    ),
 )
 _FIELDS: Final[tuple[tuple[type[Metrics], tuple[_Field, ...]], ...]] = (
     (

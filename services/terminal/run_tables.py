@@ -26,6 +26,7 @@ from services.terminal.run_words import (
     actor_words,
     actors_words,
     evaluator_words,
+    expiry_words,
     goal_words,
     learner_words,
     percent_words,
@@ -189,7 +190,7 @@ def _problems(view: RunView) -> list[Text]:
         for actor in view.living(ActorMetrics)
         if actor.put_aside
     ]
-    lines += unusual_waits(view)
+    lines += [*unusual_waits(view), *expiry_words(view)]
     lines += [
         f"{role} {name} is gone for {time.time() - since_s:.0f} s"
         for (role, name), since_s in sorted(view.vanished_s.items())

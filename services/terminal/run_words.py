@@ -50,7 +50,7 @@ def run_line(
         *map(_score_words, view.scores[-1:]),
         *map(_suite_words, view.suites[1:]),
     ]
-    parts += unusual_waits(view)
+    parts += [*unusual_waits(view), *expiry_words(view)]
     if view.vanished_s:
         parts.append("gone: " + ", ".join(f"{role} {name}" for role, name in view.vanished_s))
     return " | ".join(filter(None, parts))
@@ -104,6 +104,27 @@ def unusual_waits(view: RunView) -> list[str]:
         and (role, name) not in view.vanished_s
         and metrics.waiting_for.startswith(_UNUSUAL_WAITS)
     ]
+
+
+def expiry_words(view: RunView) -> list[str]:
+    """Such as `the certificates of hub h and 3 more expire in 12 days: ...`; empty if none does."""
+    expiring = sorted(
+        (metrics.certificate_days, role, name)
+        for (role, name), metrics in view.metrics.items()
+        if metrics.certificate_days is not None and (role, name) not in view.vanished_s
+    )
+    if not expiring:
+        return []
+    days, role, name = expiring[0]
+    more = len(expiring) - 1
+    whose = (
+        f"certificates of {role} {name} and {more} more"
+        if more
+        else f"certificate of {role} {name}"
+    )
+    when = {0: "today", 1: "tomorrow"}.get(days, f"in {days} days")
+    verb = "expire" if more else "expires"
+    return [f"the {whose} {verb} {when}: deploy/certificates.sh --renew makes new ones"]
 
 
 def success_words(success: Success, trials: int) -> str:
@@ -187,7 +208,10 @@ def evaluator_words(view: RunView, evaluator: EvaluatorMetrics) -> str:
     wanted = sum(suite.trials for suite in evaluator.suites)
     counted = counted_trials(evaluator.suites, version)
     suites = f" in {len(evaluator.suites)} suites" if len(evaluator.suites) > 1 else ""
-    return f"{counted} of {wanted} trials of policy {version}{suites}"
+    words = f"{counted} of {wanted} trials of policy {version}{suites}"
+    if counted >= wanted and evaluator.leases:
+        words += f", {evaluator.leases} of earlier ones being played"
+    return words
 
 
 def recorder_words(recorder: RecorderMetrics) -> str:

@@ -61,7 +61,7 @@ def test_one_line_summarizes_the_run() -> None:
     assert run_line(view_of(ACTOR, LEARNER, EVALUATOR), Progress(72.0, 190.0, at_least=True)) == (
         "policy 3 of 13, 1 min 12 s so far, more than 3 min left"
         " | learner: coupled training, epoch 120 of 2500, loss 0.4321, 12.5 epochs/s, 45 sequences"
-        " | evaluator: 52 of 52 trials of policy 3"
+        " | evaluator: 52 of 52 trials of policy 3, 1 of earlier ones being played"
         " | 1 actor, 81 steps/s, 17 episodes | policy 3 strict 44 of 52, 85 % (72 to 92)"
     )
 
@@ -183,3 +183,13 @@ def test_the_tables_fit_into_the_terminal_and_cut_no_word(size: tuple[int, int])
 )
 def test_durations_in_words(seconds: float, words: str) -> None:
     assert duration_words(seconds) == words
+
+
+def test_certificates_that_expire_are_told() -> None:
+    view = view_of(replace(ACTOR, certificate_days=12), LEARNER)
+    said = "the certificate of actor a-1 expires in 12 days: deploy/certificates.sh --renew"
+    assert said in shown(view)
+    assert said in run_line(view)
+    both = view_of(replace(ACTOR, certificate_days=12), replace(LEARNER, certificate_days=1))
+    assert "the certificates of learner l and 1 more expire tomorrow" in shown(both)
+    assert "certificate" not in shown(view_of(ACTOR, LEARNER))
