@@ -29,7 +29,7 @@ def load_class(
         UserError: the name is unknown, the module fails while it is imported, or the class is
             missing or incomplete. The message says which.
     """
-    known = f"Built in are: {', '.join(sorted(built_in))}"
+    known = f"Built in are: {', '.join(sorted(built_in))}" if built_in else "None is built in"
     module_name, separator, class_name = built_in.get(name, name).partition(":")
     if not separator or not _is_dotted_name(module_name) or not class_name:
         raise UserError(

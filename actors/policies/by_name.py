@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Final
 
@@ -42,13 +43,15 @@ def make_policy(name: str, task: Task) -> Policy:
     path = checkpoint_path(name)
     if path.is_file():
         return _load_network(path, task)
-    if rest and all(part.isidentifier() for part in first.split(".")):
+    names = ["tutor", *task.baselines, *pretrained_names()]
+    similar = get_close_matches(name, names, n=1, cutoff=0.8)
+    if rest and not similar and all(part.isidentifier() for part in first.split(".")):
         return _make_own(name)
-    blinded = [f"{each}:POLICY" for each in task.blinded]
-    names = ", ".join(["tutor", *task.baselines, *blinded, *pretrained_names()])
+    guess = f" Did you mean {similar[0]}?" if similar else ""
+    listed = ", ".join([*names, *(f"{each}:POLICY" for each in task.blinded)])
     raise UserError(
-        f"policy {name!r}: no such policy or checkpoint file. There are: {names}, the path of a"
-        " .safetensors checkpoint, the folder of a run, or a policy of your own as"
+        f"policy {name!r}: no such policy or checkpoint file.{guess} There are: {listed}, the path"
+        " of a .safetensors checkpoint, the folder of a run, or a policy of your own as"
         " package.module:Class."
     )
 

@@ -163,6 +163,7 @@ def test_an_unknown_policy_is_named(workers: int) -> None:
     ("words", "message"),
     [
         ("--policy nobody --trials 1", "no such policy"),
+        ("--policy pretraned:experiment1", "Did you mean pretrained:experiment1?"),
         ("--policy tutor --backend nothing", "simulator.backend: there is no 'nothing'"),
         ("--policy tutor --task experiment9", "task.name"),
         ("--policy tutor --set tutor.speed=3", "tutor.speed"),
