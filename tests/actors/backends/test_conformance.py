@@ -668,7 +668,7 @@ def test_the_outside_picture_shows_robot_table_obstacle_and_object(seeing):
     assert picture.dtype == np.uint8
     assert share_of(picture, 224, 222, 217) > 0.1  # table
     assert share_of(picture, 190, 180, 70) > 0.01  # obstacle
-    assert share_of(picture, 200, 75, 75) > 0.003  # object
+    assert share_of(picture, 200, 75, 75) > 0.002  # object, of which a part lies in shadow
     assert share_of(picture, 100, 40, 40) > 0.02  # the robot's covers
     assert share_of(picture, 40, 40, 45) > 0.003  # its hand
 
