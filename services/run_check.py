@@ -29,7 +29,7 @@ from proto.codec import MessageError
 from proto.config import Config, load_config
 from proto.episode import LOCAL, NOT_FINISHED, SIMULATION_FAILED, Kind
 from proto.errors import UserError
-from proto.outbox import PREPARED, PUT_ASIDE, message_name, message_problem
+from proto.outbox import PREPARED, PUT_ASIDE, message_name, message_problem, messages_of_run
 from proto.recordings.episodes import EpisodeSummary, read_summary
 from services.trials.trial_log import CountedTrial, parse_line
 
@@ -397,7 +397,7 @@ def _compare(policy: Checkpoint, training: Checkpoint, report: Report) -> None:
 
 
 def _check_outboxes(folder: Path, report: Report) -> None:
-    waiting = sorted((folder / "outbox").glob("*/*/*.message"))
+    waiting = sorted(messages_of_run(folder))
     for path in waiting:
         if problem := message_problem(path):
             advice = "continue the run: the actor sets it aside and does not send it"

@@ -28,7 +28,9 @@ from deploy.run_local import (
     main,
     summary,
 )
+from proto.codec import Wire
 from proto.config import Config, LearnerConfig, load_config
+from proto.outbox import Outbox, messages_of_run
 from proto.run_locks import owned_run
 
 ROOT = Path(__file__).parents[2]
@@ -89,6 +91,7 @@ def test_a_stopped_run_is_continued_to_its_end(tmp_path: Path) -> None:
         assert "4 policy versions" in output
         assert "policy 4, 10 of 10 trials counted" in output
         assert not processes_that_name(str(tmp_path))
+    assert not messages_of_run(run), "the end of the run waits for what was played"
 
     sequences = {file.name: file.stat().st_mtime_ns for file in run.glob("tutoring/*.mcap")}
     assert kept.items() <= sequences.items(), "what was taught is not taught again"
@@ -353,6 +356,8 @@ def wait_for_another(role: str, folder: Path, than: int) -> None:
 @pytest.mark.timeout(600)
 def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> None:
     run = tmp_path / "smoke"
+    outbox = Outbox(run / "outbox" / "gone" / "outcomes", lambda *_: None)
+    outbox.add("1", "vmdnn/smoke/outcome/gone", Wire("of-another-version", b""))
     with started(tmp_path) as process:
         eventually(lambda: bool(pid_of("actor", tmp_path)), "an actor runs")
         eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept", 180)
@@ -371,6 +376,9 @@ def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> N
     assert "actor was killed and is started again" in output
     assert "evaluator ended (0) and is started again" in output
     assert "policy 4, 10 of 10 trials counted" in output
+    assert "done; waiting for the receipts of" in output
+    assert "a message stays without a receipt in" in output
+    assert len(messages_of_run(run)) == 1, "nothing else stays"
     assert not processes_that_name(str(tmp_path))
     counted = (run / "evaluation" / "trials.jsonl").read_text().splitlines()
     recorded = {path.stem.rpartition("_")[2] for path in (run / "rollouts").glob("*.mcap")}
