@@ -349,7 +349,7 @@ def pid_of(role: str, folder: Path) -> int:
 
 
 def wait_for_another(role: str, folder: Path, than: int) -> None:
-    eventually(lambda: pid_of(role, folder) not in (0, than), f"another {role} runs")
+    eventually(lambda: pid_of(role, folder) not in (0, than), f"another {role} runs", 180)
 
 
 @pytest.mark.slow
@@ -359,13 +359,13 @@ def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> N
     outbox = Outbox(run / "outbox" / "gone" / "outcomes", lambda *_: None)
     outbox.add("1", "vmdnn/smoke/outcome/gone", Wire("of-another-version", b""))
     with started(tmp_path) as process:
-        eventually(lambda: bool(pid_of("actor", tmp_path)), "an actor runs")
+        eventually(lambda: bool(pid_of("actor", tmp_path)), "an actor runs", 180)
         eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept", 180)
         hub, actor = pid_of("hub", tmp_path), pid_of("actor", tmp_path)
         os.kill(hub, signal.SIGSTOP)
         os.kill(actor, signal.SIGKILL)
         log = run / "logs" / "actor.log"
-        eventually(lambda: "no hub answers" in log.read_text(), "the next actor waits for the hub")
+        eventually(lambda: "no hub answers" in log.read_text(), "the next actor waits", 180)
         os.kill(hub, signal.SIGCONT)
         for role in ("evaluator", "recorder", "learner"):
             before = pid_of(role, tmp_path)
