@@ -251,7 +251,7 @@ class Actor:
         for role in ANSWERING:
             self._bus.watch_presence(role, partial(self._on_presence, role))
         self._agreement.check()
-        self._receipts.pass_on(self._bus.id, lambda: self._outboxes)
+        self._receipts.pass_on(self._bus.id, self._outboxes)
         self._bus.subscribe_newest(
             keys.policy,
             self._on_policy,

@@ -25,6 +25,7 @@ from learner.checkpoint import (
     previous_training_file,
     training_file,
 )
+from learner.policy_digests import DIGESTS, digest_problem
 from proto.codec import MessageError
 from proto.config import Config, load_config
 from proto.episode import LOCAL, NOT_FINISHED, SIMULATION_FAILED, Kind
@@ -44,7 +45,7 @@ _FREE: Final = ("logs", "locks", "tensorboard")
 _FILES: Final[Mapping[str, tuple[str, ...]]] = {
     "": (r"config\.yaml", r"metrics[\w-]*\.jsonl"),
     "checkpoints": (r"(training|training-before|pretraining)\.safetensors", "run_id"),
-    "policies": (r"[0-9]{6}\.safetensors",),
+    "policies": (r"[0-9]{6}\.safetensors", DIGESTS),
     "evaluation": (r"(trials|round_trials|lap_trials)\.jsonl",),
     **dict.fromkeys(RECORDINGS, (r".+\.mcap",)),
 }
@@ -351,6 +352,8 @@ def _policies(folder: Path, config: Config | None, report: Report) -> dict[int, 
             policy = load_checkpoint(path)
             if config is not None:
                 check_same_network(config.network, policy, place)
+            if problem := digest_problem(path, path.read_bytes()):
+                raise UserError(problem)
         except UserError as error:
             report.findings.append(Finding(place, _short(error, path), advice))
             continue
