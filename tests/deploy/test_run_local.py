@@ -353,6 +353,22 @@ def wait_for_another(role: str, folder: Path, than: int) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("after_s", [0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0])
+def test_ctrl_c_at_any_moment_ends_everything(tmp_path: Path, after_s: float) -> None:
+    """Early ones meet the set-up or the imports, later ones processes that start."""
+    with started(tmp_path) as process:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(after_s)
+        os.killpg(process.pid, signal.SIGINT)
+        output, errors = process.communicate(timeout=120)
+    assert process.returncode in (0, 130, -signal.SIGINT), errors
+    assert "Traceback" not in output + errors
+    assert "is there a network" not in errors
+    assert not processes_that_name(str(tmp_path))
+
+
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> None:
     run = tmp_path / "smoke"
