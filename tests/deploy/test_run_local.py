@@ -343,7 +343,7 @@ def pid_of(role: str, folder: Path) -> int:
     words = [role, "--config", str(folder / "smoke" / "logs" / "config.yaml")]
     for process in Path("/proc").glob("[0-9]*/cmdline"):
         with suppress(OSError):
-            if process.read_bytes().decode(errors="replace").split("\0")[2:-1] == words:
+            if process.read_bytes().decode(errors="replace").split("\0")[2:5] == words:
                 return int(process.parent.name)
     return 0
 
