@@ -36,7 +36,7 @@ FROZEN_S = (1.0, 15.0)
 UNFINISHED = "could_not_be_finished"
 TRIALS = 6
 CASES = (0, 22, 44)
-ROUNDS = max(2, FAULTS // 10)
+ROUNDS = max(2, FAULTS // 15)
 """So many that the run goes on as long as the faults do."""
 VERSIONS = 2 + ROUNDS
 SETTINGS = {
@@ -50,7 +50,7 @@ SETTINGS = {
     "learner.publish_every_epochs": 300,
     "learner.checkpoint_every_epochs": 100,
     "learner.lease_s": 20.0,
-    "learner.corrections": f"{{rounds: {ROUNDS}, sequences: 3, tries: 6, epochs: 100}}",
+    "learner.corrections": f"{{rounds: {ROUNDS}, sequences: 3, tries: 6, epochs: 20}}",
     "evaluator.lease_s": 20.0,
     "evaluator.trials_per_policy": TRIALS,
     "evaluator.first_trials": 2,
