@@ -197,9 +197,9 @@ def _run(
                     follower.wait_for_receipts(config.run_folder, tell)
         tell("stopping")
     if left := messages_of_run(config.run_folder):
-        number = "a message stays" if len(left) == 1 else f"{len(left)} messages stay"
         outbox = config.run_folder / "outbox"
-        tell(f"{number} without a receipt in {outbox}; the same command sends what is there")
+        words = _message_words(len(left))
+        tell(f"without a receipt stay {words} in {outbox}; the same command sends what is there")
     if view is not None:
         tell(summary(view, config, time.monotonic() - started_s))
 
@@ -359,7 +359,7 @@ class _Follower:
         waiting = messages_of_run(run_folder)
         if not waiting or self._lifecycle.stopping:
             return
-        tell(f"done; waiting for the receipts of {len(waiting)} messages in outboxes")
+        tell(f"done; waiting for the receipts of {_message_words(len(waiting))} in outboxes")
         over_s = time.monotonic() + RECEIPTS_WITHIN_S
         while waiting and not self._lifecycle.stopping and time.monotonic() < over_s:
             self._lifecycle.wait(METRICS_PERIOD_S)
@@ -371,6 +371,10 @@ class _Follower:
         self._show(view)
         self._watchdog.look_unless_stopping(self._lifecycle)
         return view
+
+
+def _message_words(number: int) -> str:
+    return "one message" if number == 1 else f"{number} messages"
 
 
 def _drained(program: Program) -> Program:

@@ -393,7 +393,7 @@ def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> N
     assert "evaluator ended (0) and is started again" in output
     assert "policy 4, 10 of 10 trials counted" in output
     assert "done; waiting for the receipts of" in output
-    assert "a message stays without a receipt in" in output
+    assert "without a receipt stay one message in" in output
     assert len(messages_of_run(run)) == 1, "nothing else stays"
     assert not processes_that_name(str(tmp_path))
     counted = (run / "evaluation" / "trials.jsonl").read_text().splitlines()
