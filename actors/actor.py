@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from actors.disturbances.staging import check_abilities, check_staged, stage
+from actors.disturbances.staging import Staging, checked_staging
 from actors.inquiry import Inquiry
 from actors.left_outboxes import LOOK_EVERY_S, OUTBOXES, LeftOutboxes
 from actors.old_rollouts import divide_old_rollouts
@@ -101,6 +101,7 @@ class Assignment:
         seed: seed of the episode.
         training: id of the training that the policy comes from, empty for the tutor.
         conditions: conditions of the suite that it belongs to.
+        staging: how it is staged, if that was checked already.
     """
 
     kind: Kind
@@ -110,6 +111,7 @@ class Assignment:
     seed: int
     training: str = ""
     conditions: Conditions | None = None
+    staging: Staging | None = None
 
 
 @dataclass(frozen=True)
@@ -267,7 +269,7 @@ class Actor:
         for role in ANSWERING:
             self._bus.watch_presence(role, partial(self._on_presence, role))
         self._agreement.check()
-        self._receipts.pass_on(self._bus.id, lambda: self._outboxes)
+        self._receipts.pass_on(self._bus.id, self._outboxes)
         self._bus.subscribe_newest(
             keys.policy,
             self._on_policy,
@@ -470,7 +472,9 @@ class Actor:
             UserError: there is no policy, or the situation is not one of the task.
         """
         task = self._task_called(asked.task)
-        self._check(task, asked.situation, asked.conditions, asked.seed)
+        staging = checked_staging(
+            self._simulator, task, asked.situation, asked.conditions, asked.seed
+        )
         if self._policy is None:
             raise UserError("there is no policy to be guided")
         tutor = make_tutor(task)
@@ -483,6 +487,7 @@ class Actor:
             asked.seed,
             self._policy_run,
             asked.conditions,
+            staging,
         )
 
     def _task_called(self, name: str) -> Task:
@@ -550,21 +555,10 @@ class Actor:
             UserError: the task cannot be played under these conditions.
         """
         situation = situation_of(self._task, conditions, seed)
-        self._check(self._task, situation, conditions, seed)
-        return Assignment(kind, self._task, policy, situation, seed, self._policy_run, conditions)
-
-    def _check(
-        self, task: Task, situation: Situation, conditions: Conditions | None, seed: int
-    ) -> None:
-        """Check that an episode can be played.
-
-        Raises:
-            UserError: the situation is not one of the task, or task or simulator cannot be
-                disturbed as the conditions say.
-        """
-        check_abilities(self._simulator, conditions)
-        check_staged(task, situation, conditions)
-        stage(task, situation, conditions, seed)
+        staging = checked_staging(self._simulator, self._task, situation, conditions, seed)
+        return Assignment(
+            kind, self._task, policy, situation, seed, self._policy_run, conditions, staging
+        )
 
     def _play(self, assignment: Assignment) -> Episode:
         live_key = self._bus.keys.live(self._bus.id)
@@ -592,6 +586,7 @@ class Actor:
                     config_digest=self._agreement.digest,
                     on_step=on_step,
                     conditions=assignment.conditions,
+                    staging=assignment.staging,
                 )
         except (_StoppedError, UserError, OSError, MemoryError):
             raise  # nothing is wrong with the episode

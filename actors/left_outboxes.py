@@ -49,7 +49,6 @@ class LeftOutboxes:
         self._gone_after_s = gone_after_s
         self._away_since_s: dict[str, float] = {}
         self._held: dict[str, tuple[ExitStack, list[Outbox]]] = {}
-        self._listens_for: set[str] = set()
 
     def __len__(self) -> int:
         return sum(len(outbox) for _, outboxes in self._held.values() for outbox in outboxes)
@@ -90,15 +89,9 @@ class LeftOutboxes:
         except UserError:  # its process runs on this machine, or another actor sends them
             lock.close()
             return
-        if name not in self._listens_for:
-            self._listens_for.add(name)
-            self._receipts.pass_on(name, lambda: self._outboxes_of(name))
+        lock.enter_context(self._receipts.pass_on(name, outboxes))
         self._held[name] = lock, outboxes
         LOG.info("sends the %d messages that actor %s left behind", sum(map(len, outboxes)), name)
 
     def _send_as(self, name: str) -> Callable[..., None]:
         return lambda key, wire: self._bus.deliver_wire(self._bus.keys.renamed(key, name), wire)
-
-    def _outboxes_of(self, name: str) -> list[Outbox]:
-        held = self._held.get(name)
-        return [] if held is None else held[1]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.attention import clip_action, crop_of_focus, targets_of_action, with_attention_of
-from actors.disturbances.staging import check_abilities, check_staged, stage
+from actors.disturbances.staging import Staging, checked_staging
 from actors.policies.contract import InformedPolicy, ObservablePolicy, Policy
 from actors.simulator import Bodies, Crop, Scene, Simulator
 from actors.tasks.contract import Task
@@ -63,6 +63,7 @@ def play(
     config_digest: str = "",
     on_step: Callable[[LiveStep], None] | None = None,
     conditions: Conditions | None = None,
+    staging: Staging | None = None,
 ) -> Episode:
     """Play one episode from the task's start posture.
 
@@ -83,14 +84,14 @@ def play(
         conditions: the conditions of the suite that the episode belongs to; None for an episode
             without disturbances inside the ranges. The recorded pictures are those that the policy
             saw. The judge measures from where the object is after an outside hand moved it.
+        staging: what `checked_staging` gives for it, which can be played once; None to make it.
 
     Raises:
         UserError: the situation is not valid for the task, or task or simulator cannot be disturbed
             as the conditions say.
     """
-    check_abilities(simulator, conditions)
-    check_staged(task, situation, conditions)
-    staging = stage(task, situation, conditions, seed)
+    if staging is None:
+        staging = checked_staging(simulator, task, situation, conditions, seed)
     started_s = time.time()
     simulator.reset(staging.scene)
     judge = task.judge(staging.situation)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from typing import Final
 
 from proto.bus import Bus
@@ -25,16 +26,22 @@ class Receipts:
         for role in RECEIVERS:
             bus.watch_presence(role, self._on_presence(role))
 
-    def pass_on(self, actor: str, outboxes: Callable[[], Iterable[Outbox]]) -> None:
+    def pass_on(self, actor: str, outboxes: Iterable[Outbox]) -> ExitStack:
         """Pass the receipts for an actor on to outboxes, from now on.
 
         Args:
             actor: id of the actor.
-            outboxes: gives the outboxes that hold its messages at that moment.
+            outboxes: hold its messages.
+
+        Returns:
+            Ends it when it is closed.
         """
+        subscriptions = ExitStack()
         for role in RECEIVERS:
             key = self._bus.keys.receipt(role, actor)
-            self._bus.subscribe_with_sender(key, self._on_receipt(role, outboxes), Receipt)
+            receive = self._on_receipt(role, outboxes)
+            subscriptions.callback(self._bus.subscribe_with_sender(key, receive, Receipt))
+        return subscriptions
 
     def _on_presence(self, role: Role) -> Callable[[str, bool], None]:
         def on_change(name: str, alive: bool) -> None:
@@ -46,14 +53,14 @@ class Receipts:
         return on_change
 
     def _on_receipt(
-        self, role: Role, outboxes: Callable[[], Iterable[Outbox]]
+        self, role: Role, outboxes: Iterable[Outbox]
     ) -> Callable[[Receipt, Sender], None]:
         def on_receipt(receipt: Receipt, sender: Sender) -> None:
             if sender.role is not role or sender not in self._present:
                 problem = f"it gives receipts of a {role}, but is none that is present in this run"
                 self._bus.refuse(str(sender), problem)
                 return
-            for outbox in outboxes():
+            for outbox in outboxes:
                 if receipt.refusal:
                     outbox.refused(receipt.episode, receipt.refusal)
                 else:

@@ -6,8 +6,9 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from textwrap import wrap
 from typing import Final
@@ -26,6 +27,7 @@ from proto.lifecycle import Lifecycle
 from proto.machine import usable_cores
 from proto.membership import METRICS_PERIOD_S
 from proto.metrics import EvaluatorMetrics, LearnerMetrics, PolicyScore, SuiteScore
+from proto.outbox import messages_of_run
 from proto.permissions import Holder
 from proto.run_locks import owned_run
 from proto.security import certificate_for
@@ -39,6 +41,10 @@ from services.terminal.run_progress import ProgressMeter
 from services.terminal.run_words import duration_words, success_words
 
 DEFAULT_CONFIG: Final = Path(__file__).parent / "config" / "experiment1.yaml"
+RECEIPTS_WITHIN_S: Final = 60.0
+"""A run that is done waits so long for messages in outboxes; a killed actor is back before."""
+DRAIN_S: Final = 10
+"""An actor that is to stop waits so long for receipts; the receivers are stopped after it."""
 _NARROW: Final = 79
 FEW_CASES: Final = 10
 """With so few tutored cases a run teaches nothing, and says so at its end."""
@@ -169,25 +175,33 @@ def _run(
     )
     if dashboard is not None:
         console.print(f"watch it at {page_address(*dashboard)}", highlight=False, soft_wrap=True)
-    started = programs(config, file, actors)
+    started = [_drained(program) for program in programs(config, file, actors)]
     if dashboard is not None:
         started.append(dashboard_program(file, *dashboard))
+
+    def tell(text: str) -> None:
+        console.print(text, highlight=False, soft_wrap=True)
+
     with Supervisor(started, logs) as supervisor:
-        watchdog = Watchdog(
-            supervisor, lambda text: console.print(text, highlight=False, soft_wrap=True)
-        )
+        watchdog = Watchdog(supervisor, tell)
         supervisor.start("hub")
         view = None
         with _connect(config, watchdog, lifecycle) or nullcontext() as bus:
             if bus is not None:
                 for program in supervisor.programs[1:]:
                     supervisor.start(program.name)
-                show = display(console, ProgressMeter(started_s=started_s), _expected(actors))
-                view = _follow(Board(bus), watchdog, lifecycle, show)
-        console.print("stopping", highlight=False)
+                meter = ProgressMeter(started_s=started_s)
+                with display(console, meter, _expected(actors)) as show:
+                    follower = _Follower(Board(bus), watchdog, lifecycle, show)
+                    view = follower.follow_until_done()
+                    follower.wait_for_receipts(config.run_folder, tell)
+        tell("stopping")
+    if left := messages_of_run(config.run_folder):
+        outbox = config.run_folder / "outbox"
+        words = _message_words(len(left))
+        tell(f"without a receipt stay {words} in {outbox}; the same command sends what is there")
     if view is not None:
-        text = summary(view, config, time.monotonic() - started_s)
-        console.print(text, highlight=False, soft_wrap=True)
+        tell(summary(view, config, time.monotonic() - started_s))
 
 
 def dashboard_place(config: Config) -> tuple[str, int] | None:
@@ -320,21 +334,55 @@ def _expected(actors: Mapping[str, int]) -> Mapping[Role, int]:
     return {**others, Role.ACTOR: sum(actors.values())}
 
 
-def _follow(
-    board: Board,
-    watchdog: Watchdog,
-    lifecycle: Lifecycle,
-    showing: AbstractContextManager[Show],
-) -> RunView:
-    """Show the state of the run until it is done or is to stop; return the last state."""
-    with showing as show:
+class _Follower:
+    """Looks after a run and shows its state."""
+
+    def __init__(self, board: Board, watchdog: Watchdog, lifecycle: Lifecycle, show: Show) -> None:
+        self._board = board
+        self._watchdog = watchdog
+        self._lifecycle = lifecycle
+        self._show = show
+
+    def follow_until_done(self) -> RunView:
+        """Go on until the run is done or is to stop; return the last state."""
         while True:
-            view = board.view()
-            show(view)
-            watchdog.look_unless_stopping(lifecycle)
-            if lifecycle.stopping or is_done(view):
+            view = self._look()
+            if self._lifecycle.stopping or is_done(view):
                 return view
-            lifecycle.wait(METRICS_PERIOD_S)
+            self._lifecycle.wait(METRICS_PERIOD_S)
+
+    def wait_for_receipts(self, run_folder: Path, tell: Callable[[str], None]) -> None:
+        """Wait until what is in outboxes now has been received, or the time is up.
+
+        What actors play meanwhile is not waited for here: they send it before they end.
+        """
+        waiting = messages_of_run(run_folder)
+        if not waiting or self._lifecycle.stopping:
+            return
+        tell(f"done; waiting for the receipts of {_message_words(len(waiting))} in outboxes")
+        over_s = time.monotonic() + RECEIPTS_WITHIN_S
+        while waiting and not self._lifecycle.stopping and time.monotonic() < over_s:
+            self._lifecycle.wait(METRICS_PERIOD_S)
+            self._look()
+            waiting &= messages_of_run(run_folder)
+
+    def _look(self) -> RunView:
+        view = self._board.view()
+        self._show(view)
+        self._watchdog.look_unless_stopping(self._lifecycle)
+        return view
+
+
+def _message_words(number: int) -> str:
+    return "one message" if number == 1 else f"{number} messages"
+
+
+def _drained(program: Program) -> Program:
+    """The program, such that an actor that is to stop waits for its receipts first."""
+    if program.role is not Role.ACTOR:
+        return program
+    command = (*program.command, "--drain", str(DRAIN_S))
+    return replace(program, command=command, stop_within_s=program.stop_within_s + DRAIN_S)
 
 
 def _connect(config: Config, watchdog: Watchdog, lifecycle: Lifecycle) -> Bus | None:

@@ -33,4 +33,8 @@ done
 # shellcheck source=deploy/setup.sh
 source "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")/setup.sh"
 setup "$@"
-PYTHONPATH="$ROOT${PYTHONPATH:+:$PYTHONPATH}" exec "$VENV/bin/python" -m deploy.run_local "$@"
+# Until run_local handles signals itself, Ctrl-C ends it without a stack trace: nothing is started yet.
+PYTHONPATH="$ROOT${PYTHONPATH:+:$PYTHONPATH}" exec "$VENV/bin/python" -c '
+import runpy, signal
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+runpy.run_module("deploy.run_local", run_name="__main__", alter_sys=True)' "$@"

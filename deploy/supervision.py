@@ -448,6 +448,11 @@ def _short_folder() -> tempfile.TemporaryDirectory[str]:
 
 def _section(rank: int, program: Program, folder: Path, heartbeats: Path) -> str:
     name = "%(program_name)s" if program.processes == 1 else "%(program_name)s-%(process_num)d"
+    environment = {
+        "OMP_NUM_THREADS": program.threads,
+        HEARTBEAT_FILE: f"{_plain(heartbeats)}/{name}",
+        "TMPDIR": _plain(heartbeats),  # what a killed process leaves there goes with the supervisor
+    }
     return f"""\
 [program:{program.name}]
 command={_plain(shlex.join((*_DIES_WITH_PARENT, *program.command)))}
@@ -455,7 +460,7 @@ process_name={name}
 numprocs={program.processes}
 numprocs_start=1
 priority={rank}
-environment=OMP_NUM_THREADS="{program.threads}",{HEARTBEAT_FILE}="{_plain(heartbeats)}/{name}"
+environment={",".join(f'{key}="{value}"' for key, value in environment.items())}
 autostart=false
 autorestart=false
 startsecs=0

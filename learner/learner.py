@@ -21,6 +21,7 @@ from learner.checkpoint import (
     previous_training_file,
     training_file,
 )
+from learner.policy_digests import digest_problem
 from learner.policy_message import policy_message
 from learner.training.recent_epochs import RecentEpochs
 from learner.training.training_run import (
@@ -63,7 +64,7 @@ from proto.players import Players
 from proto.recordings.episodes import EpisodeSummary
 from proto.seeds import SEEDS_PER_CASE
 from proto.senders import Sender
-from proto.storage import change_suffix, delete_file, parts_in, rename, written_whole
+from proto.storage import change_suffix, rename, written_whole
 from proto.variables import Situation
 
 LOG = logging.getLogger(__name__)
@@ -117,7 +118,6 @@ class Learner:
         self._bus = bus
         self._lifecycle = lifecycle
         self._folder = config.run_folder
-        _delete_unfinished_files(self._folder)
         tutored_cases = {name: len(task.tutored()) for name, task in tasks.items()}
         self._curriculum = Curriculum(config, tutored_cases)
         self._tasks = tasks
@@ -466,6 +466,8 @@ class Learner:
             try:
                 content = path.read_bytes()
                 metadata = checkpoint_from_bytes(content, f"policy {path}").metadata
+                if problem := digest_problem(path, content):
+                    raise UserError(f"policy {path} is damaged: {problem}")
             except OSError:  # it is gone, or was set aside
                 continue
             except UserError as error:
@@ -487,14 +489,6 @@ class Learner:
             self._bus.keys.policy, policy_message(self._run_id, metadata, content)
         )
         LOG.info("policy %d is published (epoch %d)", version, metadata.epoch)
-
-
-def _delete_unfinished_files(folder: Path) -> None:
-    """Delete what killed learners left half written; no other process writes to these folders."""
-    own = (folder / name for name in ("tutoring", "pretraining", "checkpoints", "policies"))
-    for place in (folder, *own):
-        for unfinished in parts_in(place):
-            delete_file(unfinished)
 
 
 def _stores(config: Config) -> Mapping[str, TutoringStore]:

@@ -329,7 +329,10 @@ class Bus:
         Returns:
             A function that ends the subscription, if it is to end before the bus is closed.
         """
-        declared = self._session.declare_subscriber(key, self._receiver(callback, classes))
+        return self._subscribed(key, self._receiver(callback, classes))
+
+    def _subscribed(self, key: str, receive: Callable[[zenoh.Sample], None]) -> Callable[[], None]:
+        declared = self._session.declare_subscriber(key, receive)
         self._declared.append(declared)
 
         def end() -> None:
@@ -356,15 +359,18 @@ class Bus:
 
     def subscribe_with_sender(
         self, key: str, callback: Callable[[M, Sender], None], *classes: type[M]
-    ) -> None:
-        """Subscribe to messages that only some may send: the callback gets the sender as well."""
+    ) -> Callable[[], None]:
+        """Subscribe to messages that only some may send: the callback gets the sender as well.
+
+        Gives a function that ends the subscription.
+        """
 
         def receive(sample: zenoh.Sample) -> None:
             message, sender = self._decode(sample, *classes)
             if sender is not None:
                 callback(message, sender)
 
-        self._declared.append(self._session.declare_subscriber(key, self._guarded(receive)))
+        return self._subscribed(key, self._guarded(receive))
 
     def subscribe_newest(
         self,

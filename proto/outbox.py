@@ -280,6 +280,11 @@ def message_name(path: Path) -> str:
     return path.stem.partition("-")[2]
 
 
+def messages_of_run(run_folder: Path) -> set[Path]:
+    """The files of all messages that wait for receipts in the outboxes of a run's folder."""
+    return set((run_folder / "outbox").glob("*/*/*.message"))
+
+
 def message_problem(path: Path) -> str:
     """Return why a file of an outbox is damaged; empty if it is not, or is gone."""
     try:

@@ -148,6 +148,7 @@ def link_file(path: Path, other: Path) -> None:
                 shutil.copyfileobj(source, stream)
             return
         part.replace(other)
+        part.unlink(missing_ok=True)  # it stays if `other` was this file's second name before
         _sync_folder(other.parent)
 
 

@@ -25,11 +25,12 @@ from learner.checkpoint import (
     previous_training_file,
     training_file,
 )
+from learner.policy_digests import DIGESTS, digest_problem
 from proto.codec import MessageError
 from proto.config import Config, load_config
 from proto.episode import LOCAL, NOT_FINISHED, SIMULATION_FAILED, Kind
 from proto.errors import UserError
-from proto.outbox import PREPARED, PUT_ASIDE, message_name, message_problem
+from proto.outbox import PREPARED, PUT_ASIDE, message_name, message_problem, messages_of_run
 from proto.recordings.episodes import EpisodeSummary, read_summary
 from services.trials.trial_log import CountedTrial, parse_line
 
@@ -44,7 +45,7 @@ _FREE: Final = ("logs", "locks", "tensorboard")
 _FILES: Final[Mapping[str, tuple[str, ...]]] = {
     "": (r"config\.yaml", r"metrics[\w-]*\.jsonl"),
     "checkpoints": (r"(training|training-before|pretraining)\.safetensors", "run_id"),
-    "policies": (r"[0-9]{6}\.safetensors",),
+    "policies": (r"[0-9]{6}\.safetensors", DIGESTS),
     "evaluation": (r"(trials|round_trials|lap_trials)\.jsonl",),
     **dict.fromkeys(RECORDINGS, (r".+\.mcap",)),
 }
@@ -351,6 +352,8 @@ def _policies(folder: Path, config: Config | None, report: Report) -> dict[int, 
             policy = load_checkpoint(path)
             if config is not None:
                 check_same_network(config.network, policy, place)
+            if problem := digest_problem(path, path.read_bytes()):
+                raise UserError(problem)
         except UserError as error:
             report.findings.append(Finding(place, _short(error, path), advice))
             continue
@@ -397,7 +400,7 @@ def _compare(policy: Checkpoint, training: Checkpoint, report: Report) -> None:
 
 
 def _check_outboxes(folder: Path, report: Report) -> None:
-    waiting = sorted((folder / "outbox").glob("*/*/*.message"))
+    waiting = sorted(messages_of_run(folder))
     for path in waiting:
         if problem := message_problem(path):
             advice = "continue the run: the actor sets it aside and does not send it"

@@ -76,6 +76,20 @@ def stage(task: Task, situation: Situation, conditions: Conditions | None, seed:
     return Staging(replace(scene, shoves=(shove,)), after, step + 1, _as_it_is)
 
 
+def checked_staging(
+    simulator: Simulator, task: Task, situation: Situation, conditions: Conditions | None, seed: int
+) -> Staging:
+    """Stage an episode that a simulator is to play; see `stage`.
+
+    Raises:
+        UserError: the situation is none of the task, or task or simulator cannot be disturbed as
+            the conditions say.
+    """
+    check_abilities(simulator, conditions)
+    check_staged(task, situation, conditions)
+    return stage(task, situation, conditions, seed)
+
+
 def check_suite(task: Task, suite: Suite) -> None:
     """Refuse a suite that no actor could play with a task.
 

@@ -13,12 +13,20 @@ from learner.checkpoint import (
     previous_training_file,
     training_file,
 )
+from learner.policy_digests import note_digest
 from learner.training.recipe import Recipe
 from learner.training.trainer import Trainer
 from learner.tutoring.store import TutoringStore
 from proto.errors import UserError
 from proto.metrics import Stage
-from proto.storage import StorageError, change_suffix, link_file, written_whole
+from proto.storage import (
+    StorageError,
+    change_suffix,
+    delete_file,
+    link_file,
+    parts_in,
+    written_whole,
+)
 
 LOG = logging.getLogger(__name__)
 
@@ -32,6 +40,8 @@ def open_training(
     rounds: int = 0,
 ) -> Trainer:
     """Go on with the training in a run's folder, or start it if there is none.
+
+    What a killed training left half written is deleted.
 
     If the newest checkpoint is damaged or gone, the one before is used: what was trained since then
     is trained again. The damaged file gets the suffix `.damaged`.
@@ -47,10 +57,19 @@ def open_training(
     Raises:
         UserError: the folder has a training of another network, or all its checkpoints are damaged.
     """
+    _delete_unfinished_files(folder)
     path = _usable_training_file(folder)
     if path is not None:
         return Trainer.restore(path, recipe, store, pretraining_store, rounds=rounds)
     return Trainer(recipe, store, pretraining_store, rounds=rounds)
+
+
+def _delete_unfinished_files(folder: Path) -> None:
+    """Delete what killed trainings left half written; no other process writes to these folders."""
+    own = (folder / name for name in ("tutoring", "pretraining", "checkpoints", "policies"))
+    for place in (folder, *own):
+        for unfinished in parts_in(place):
+            delete_file(unfinished)
 
 
 def _usable_training_file(folder: Path) -> Path | None:
@@ -143,7 +162,7 @@ def write_policy(trainer: Trainer, folder: Path) -> None:
     computed again, nothing is written; otherwise the next free version is taken.
 
     Raises:
-        StorageError: the file cannot be written there; nothing has changed.
+        StorageError: it cannot be written there; the next call tries it again.
     """
     before = version = trainer.version
     while True:
@@ -153,11 +172,13 @@ def write_policy(trainer: Trainer, folder: Path) -> None:
         if not file.exists() and not damaged:
             break
         if not damaged and file.read_bytes() == content:
+            note_digest(file, content)
             return
         LOG.warning("policy %d exists already and is another one; it stays as it is", version)
     try:
         with written_whole(file) as stream:
             stream.write(content)
+        note_digest(file, content)
     except StorageError:
         trainer.version = before
         raise

@@ -166,12 +166,7 @@ class Round:
         with self._lock:
             if not self._is_of_policy(report) or report.seed not in self._missing:
                 return False
-            if self._failures.counts(report.seed, report.id):
-                return False
-            if not self._failures.take_request(report.seed, report.actor):
-                return False
-            self._leases.finish(report.seed, report.actor)
-            if not self._failures.add(report.seed, report.id):
+            if not self._failures.fail(report.seed, report, self._leases):
                 return False
             del self._missing[report.seed]
             self._given_up.add(report.seed)

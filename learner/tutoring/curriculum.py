@@ -45,7 +45,7 @@ class Curriculum:
         self._planned = frozenset(map(_key, planned))
         self._sizes = Counter(case.task for case in planned)
         self._missing = {_key(case): case for case in planned}  # in the order of the plan
-        self._leases: Leases[TutoringCase] = Leases(config.learner.lease_s)
+        self._leases: Leases[CaseKey] = Leases(config.learner.lease_s)
         self._failures: Failures[CaseKey] = Failures()
         self._lock = threading.Lock()
 
@@ -61,10 +61,11 @@ class Curriculum:
     def next_case(self, actor: str) -> TutoringCase | None:
         """A case for this actor to demonstrate; None if none is left."""
         with self._lock:
-            case = self._leases.take(actor, self._missing.values())
-            if case is not None:
-                self._failures.ask(_key(case), actor)
-            return case
+            key = self._leases.take(actor, self._missing)
+            if key is None:
+                return None
+            self._failures.ask(key, actor)
+            return self._missing[key]
 
     def release(self, actor: str) -> None:
         """Hand out again what an actor that vanished was demonstrating."""
@@ -85,7 +86,8 @@ class Curriculum:
         """Note that a sequence is kept: its case need not be demonstrated any more."""
         with self._lock:
             if self._lacks(shown):
-                self._leases.finish(self._missing.pop(_key(shown)))
+                del self._missing[_key(shown)]
+                self._leases.finish(_key(shown))
 
     def fail(self, report: EpisodeFailed) -> bool:
         """Note that a case could not be shown; whether the case is given up for that.
@@ -96,12 +98,7 @@ class Curriculum:
             if not self._lacks(report):
                 return False
             key = _key(report)
-            if self._failures.counts(key, report.id):
-                return False
-            if not self._failures.take_request(key, report.actor):
-                return False
-            self._leases.finish(self._missing[key], report.actor)
-            if not self._failures.add(key, report.id):
+            if not self._failures.fail(key, report, self._leases):
                 return False
             del self._missing[key]
             self._sizes[report.task] -= 1

@@ -7,6 +7,8 @@ from collections.abc import Hashable
 from typing import Final, Generic, Protocol, TypeVar
 
 from proto.episode import Kind
+from proto.leases import Leases
+from proto.messages import EpisodeFailed
 from proto.suites import Conditions
 
 TRIES: Final = 3
@@ -63,6 +65,16 @@ class Failures(Generic[Item]):
             return False
         self._asked[item, actor] -= 1
         return True
+
+    def fail(self, item: Item, report: EpisodeFailed, leases: Leases[Item]) -> bool:
+        """Count a report of a failure and end the actor's lease; whether the item had all TRIES.
+
+        The report of an actor that was not asked, or that was counted before, is ignored.
+        """
+        if self.counts(item, report.id) or not self.take_request(item, report.actor):
+            return False
+        leases.finish(item, report.actor)
+        return self.add(item, report.id)
 
     def counts(self, item: Item, report: str) -> bool:
         """Whether a report of an item was counted before; it may come again, late."""

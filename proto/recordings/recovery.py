@@ -103,9 +103,10 @@ def _records(path: Path) -> tuple[list[McapRecord], bool]:
 
 
 def _count(kept: Sequence[McapRecord], intact: bool) -> Recovered:
-    step_channels = {
-        record.id for record in kept if isinstance(record, Channel) and record.topic == STEP
-    }
+    topics: dict[int, str] = {}
+    for record in kept:
+        if isinstance(record, Channel):
+            topics.setdefault(record.id, record.topic)  # the first counts, see `_register`
     messages = [record for record in kept if isinstance(record, Message)]
     played = [
         int(record.metadata["steps"])
@@ -118,7 +119,7 @@ def _count(kept: Sequence[McapRecord], intact: bool) -> Recovered:
     return Recovered(
         intact=intact,
         messages=len(messages),
-        steps=sum(message.channel_id in step_channels for message in messages),
+        steps=sum(topics.get(message.channel_id) == STEP for message in messages),
         steps_played=played[0] if played else None,
     )
 

@@ -34,7 +34,8 @@ from proto.plain_text import plain
 from proto.reading import read_limited
 from proto.recordings.schemas import ACTION_FIELDS
 from proto.storage import written_whole
-from services.exchange.foreign import check_picture, eye_picture, foreign_episode
+from services.exchange.contained import contained
+from services.exchange.foreign import LARGEST_SIDE, check_picture, eye_picture, foreign_episode
 from services.exchange.joint_map import JointMap, own_map
 from services.exchange.lerobot_statistics import (
     Statistics,
@@ -399,14 +400,22 @@ def _png(image: Image) -> bytes:
 def import_lerobot(folder: Path, joint_map: JointMap | None, task: str) -> Iterator[Episode]:
     """Yield the episodes of a LeRobotDataset as tutoring sequences of a task.
 
+    They are read in a process of its own: a small file can ask for any amount of memory and time.
+
     Args:
         folder: the data set.
         joint_map: what its actions are; None if vmdnn exported it.
         task: name of the task.
 
     Raises:
-        UserError: it is no data set of version 3.0, or its content does not fit.
+        UserError: it is no data set of version 3.0, its content does not fit, or it is made to take
+            too much memory or time.
     """
+    return contained(read_lerobot, folder, joint_map, task)
+
+
+def read_lerobot(folder: Path, joint_map: JointMap | None, task: str) -> Iterator[Episode]:
+    """`import_lerobot` in this process, without limits of memory and time."""
     info = _read_info(folder)
     joint_map = joint_map or own_map()
     key = _picture(info, joint_map, folder)
@@ -540,7 +549,7 @@ class _Reader:
             or unpacked > _UNPACKED_BYTES + _UNPACKED_PER_BYTE * size
         ):
             raise ValueError(f"{path} is too large when it is unpacked")
-        return self._pq.read_table(path)
+        return self._pq.read_table(path, use_threads=False)
 
     def _decoded(self, packed: Mapping[str, Any]) -> Image:
         content = packed["bytes"]
@@ -577,6 +586,8 @@ def _video_pictures(path: Path) -> Image:
     with av.open(str(path)) as container:
         for stream in container.streams.video[:1]:
             check_picture(stream.codec_context.height, stream.codec_context.width)
+            # The size may change later in the stream.
+            stream.codec_context.options = {"max_pixels": str(LARGEST_SIDE**2)}
         for frame in container.decode(video=0):
             left -= frame.width * frame.height
             if left < 0:

@@ -75,7 +75,16 @@ class _Viewers(ServerListener):
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
         """Note that a client does not view a topic any more."""
         with self._lock:
-            self._viewers.get(channel.topic, set()).discard(client.id)
+            viewers = self._viewers.get(channel.topic, set())
+            viewers.discard(client.id)
+            if not viewers:
+                self._viewers.pop(channel.topic, None)
+
+    def forget(self, topics: Mapping[str, str]) -> None:
+        """Forget who viewed topics (the values) that are withdrawn."""
+        with self._lock:
+            for topic in topics.values():
+                self._viewers.pop(topic, None)
 
     def views_any(self, topics: Mapping[str, str]) -> bool:
         """Whether anybody views one of the topics (the values)."""
@@ -248,7 +257,9 @@ class LiveView:
         shown = [name for name in present if name in self._stages]
         shown += [name for name in present if name not in self._stages][: MOST_ACTORS - len(shown)]
         for name in self._stages.keys() - set(shown):
-            self._stages.pop(name).close()
+            gone = self._stages.pop(name)
+            gone.close()
+            self._viewers.forget(gone.topics)
         for name in shown:
             if name not in self._stages:
                 self._stages[name] = _Stage(self._context, f"actors/{name}", self._period_s)

@@ -28,7 +28,9 @@ from deploy.run_local import (
     main,
     summary,
 )
+from proto.codec import Wire
 from proto.config import Config, LearnerConfig, load_config
+from proto.outbox import Outbox, messages_of_run
 from proto.run_locks import owned_run
 
 ROOT = Path(__file__).parents[2]
@@ -89,6 +91,7 @@ def test_a_stopped_run_is_continued_to_its_end(tmp_path: Path) -> None:
         assert "4 policy versions" in output
         assert "policy 4, 10 of 10 trials counted" in output
         assert not processes_that_name(str(tmp_path))
+    assert not messages_of_run(run), "the end of the run waits for what was played"
 
     sequences = {file.name: file.stat().st_mtime_ns for file in run.glob("tutoring/*.mcap")}
     assert kept.items() <= sequences.items(), "what was taught is not taught again"
@@ -340,27 +343,45 @@ def pid_of(role: str, folder: Path) -> int:
     words = [role, "--config", str(folder / "smoke" / "logs" / "config.yaml")]
     for process in Path("/proc").glob("[0-9]*/cmdline"):
         with suppress(OSError):
-            if process.read_bytes().decode(errors="replace").split("\0")[2:-1] == words:
+            if process.read_bytes().decode(errors="replace").split("\0")[2:5] == words:
                 return int(process.parent.name)
     return 0
 
 
 def wait_for_another(role: str, folder: Path, than: int) -> None:
-    eventually(lambda: pid_of(role, folder) not in (0, than), f"another {role} runs")
+    eventually(lambda: pid_of(role, folder) not in (0, than), f"another {role} runs", 180)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("after_s", [0.2, 0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0])
+def test_ctrl_c_at_any_moment_ends_everything(tmp_path: Path, after_s: float) -> None:
+    """Early ones meet the set-up or the imports, later ones processes that start."""
+    with started(tmp_path) as process:
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(after_s)
+        os.killpg(process.pid, signal.SIGINT)
+        output, errors = process.communicate(timeout=120)
+    assert process.returncode in (0, 130, -signal.SIGINT), errors
+    assert "Traceback" not in output + errors
+    assert "is there a network" not in errors
+    assert not processes_that_name(str(tmp_path))
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> None:
     run = tmp_path / "smoke"
+    outbox = Outbox(run / "outbox" / "gone" / "outcomes", lambda *_: None)
+    outbox.add("1", "vmdnn/smoke/outcome/gone", Wire("of-another-version", b""))
     with started(tmp_path) as process:
-        eventually(lambda: bool(pid_of("actor", tmp_path)), "an actor runs")
+        eventually(lambda: bool(pid_of("actor", tmp_path)), "an actor runs", 180)
         eventually(lambda: any(run.glob("tutoring/*.mcap")), "a sequence is kept", 180)
         hub, actor = pid_of("hub", tmp_path), pid_of("actor", tmp_path)
         os.kill(hub, signal.SIGSTOP)
         os.kill(actor, signal.SIGKILL)
         log = run / "logs" / "actor.log"
-        eventually(lambda: "no hub answers" in log.read_text(), "the next actor waits for the hub")
+        eventually(lambda: "no hub answers" in log.read_text(), "the next actor waits", 180)
         os.kill(hub, signal.SIGCONT)
         for role in ("evaluator", "recorder", "learner"):
             before = pid_of(role, tmp_path)
@@ -371,6 +392,9 @@ def test_a_run_survives_a_frozen_hub_and_processes_that_end(tmp_path: Path) -> N
     assert "actor was killed and is started again" in output
     assert "evaluator ended (0) and is started again" in output
     assert "policy 4, 10 of 10 trials counted" in output
+    assert "done; waiting for the receipts of" in output
+    assert "without a receipt stay one message in" in output
+    assert len(messages_of_run(run)) == 1, "nothing else stays"
     assert not processes_that_name(str(tmp_path))
     counted = (run / "evaluation" / "trials.jsonl").read_text().splitlines()
     recorded = {path.stem.rpartition("_")[2] for path in (run / "rollouts").glob("*.mcap")}

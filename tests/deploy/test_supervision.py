@@ -30,10 +30,9 @@ SLEEP = (sys.executable, "-c", "import time; time.sleep(600)")
 
 def is_alive(pid: int) -> bool:
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
         return False
-    return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text()
 
 
 def states(supervisor: Supervisor) -> dict[str, ProcessState]:
@@ -191,6 +190,17 @@ def test_a_long_folder_for_temporary_files_is_no_problem(
     with Supervisor([Program("actor", SLEEP)], tmp_path) as supervisor:
         supervisor.start("actor")
         assert states(supervisor)["actor"].state in {"STARTING", "RUNNING"}
+
+
+def test_what_a_killed_process_leaves_in_its_temporary_folder_is_deleted(tmp_path: Path) -> None:
+    leaves = "import os, tempfile; print(tempfile.mkdtemp(), flush=True); os.kill(os.getpid(), 9)"
+    log = tmp_path / "actor.log"
+    with Supervisor([Program("actor", (sys.executable, "-c", leaves))], tmp_path) as supervisor:
+        supervisor.start("actor")
+        eventually(lambda: log.exists() and log.read_text().endswith("\n"), "it has left something")
+        left = Path(log.read_text().strip())
+        assert left.is_dir()
+    assert not left.exists()
 
 
 def test_each_program_gets_its_own_thread_count(tmp_path: Path) -> None:

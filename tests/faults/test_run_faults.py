@@ -23,13 +23,22 @@ from ports import free_endpoint
 from processes import eventually
 
 from learner.checkpoint import load_checkpoint
+from proto.episode import Kind
+from proto.outbox import messages_of_run
 from proto.recordings.episodes import read_episode
+from services.run_check import check_run
 
 FAULTS = int(os.environ.get("VMDNN_FAULTS", "300"))
-UNFINISHED = "could_not_be_finished"
 SEED = int(os.environ.get("VMDNN_FAULT_SEED", "1"))
-TRIALS = 4
+BETWEEN_S = (1.0, 10.0)
+"""Time between two faults: each process is hit every 40 s or so, often while it starts."""
+FROZEN_S = (1.0, 15.0)
+UNFINISHED = "could_not_be_finished"
+TRIALS = 6
 CASES = (0, 22, 44)
+ROUNDS = max(2, FAULTS // 15)
+"""So many that the run goes on as long as the faults do."""
+VERSIONS = 2 + ROUNDS
 SETTINGS = {
     "run.name": "faults",
     "simulator.render": "false",
@@ -37,16 +46,16 @@ SETTINGS = {
     "learner.cases": list(CASES),
     "learner.start_sequences": 3,
     "learner.pretraining.epochs": 2,
-    "learner.epochs": 3000,
+    "learner.epochs": 600,
     "learner.publish_every_epochs": 300,
     "learner.checkpoint_every_epochs": 100,
     "learner.lease_s": 20.0,
+    "learner.corrections": f"{{rounds: {ROUNDS}, sequences: 3, tries: 6, epochs: 20}}",
     "evaluator.lease_s": 20.0,
     "evaluator.trials_per_policy": TRIALS,
-    "learner.corrections.rounds": 0,
+    "evaluator.first_trials": 2,
     "done": "{}",
 }
-VERSIONS = 10
 
 
 class FaultyRun:
@@ -60,11 +69,14 @@ class FaultyRun:
         settings = {**SETTINGS, "run.folder": folder, "hub.endpoint": free_endpoint()}
         words = [word for key, value in settings.items() for word in ("--set", f"{key}={value}")]
         self.output = folder / "output"
+        self.temporary = folder / "temporary"
+        self.temporary.mkdir()
         with self.output.open("wb") as stream:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "deploy.run_local", "--actors", "2", *words],
                 stdout=stream,
                 stderr=subprocess.STDOUT,
+                env={**os.environ, "TMPDIR": str(self.temporary)},
             )
 
     def pids(self) -> dict[int, str]:
@@ -89,11 +101,11 @@ class FaultyRun:
             os.kill(pid, number)
             self.done[f"{number.name} {pids[pid]}"] += 1
             if number is signal.SIGSTOP:
-                self._frozen[pid] = time.monotonic() + self._chance.uniform(1.0, 15.0)
+                self._frozen[pid] = time.monotonic() + self._chance.uniform(*FROZEN_S)
 
     def pause(self) -> None:
         """Give the processes a moment."""
-        time.sleep(self._chance.uniform(0.5, 5.0))
+        time.sleep(self._chance.uniform(*BETWEEN_S))
 
     def calm(self) -> None:
         """Wake all."""
@@ -106,10 +118,36 @@ class FaultyRun:
                 with suppress(ProcessLookupError):
                     os.kill(pid, signal.SIGCONT)
 
+    def held(self) -> tuple[float, int]:
+        """Memory (MiB) and number of open files of run_local itself, which lives all the time."""
+        process = Path("/proc") / str(self.process.pid)
+        status = (process / "status").read_text().splitlines()
+        kib = next(int(line.split()[1]) for line in status if line.startswith("VmRSS"))
+        return kib / 1024, len(list((process / "fd").iterdir()))
+
+    def stop(self) -> None:
+        """Stop it as Ctrl-C does."""
+        self.process.send_signal(signal.SIGINT)
+        assert self.process.wait(120) == 0
+
     def counted(self) -> list[dict[str, Any]]:
         log = self.folder / "evaluation" / "trials.jsonl"
         lines = log.read_text().splitlines() if log.exists() else []
         return [json.loads(line) for line in lines]
+
+    def recorded(self) -> list[Path]:
+        return list((self.folder / "rollouts").glob("*.mcap"))
+
+    def shown(self) -> list[Path]:
+        return list((self.folder / "tutoring").glob("*.mcap"))
+
+    def versions(self) -> int:
+        return len(list((self.folder / "policies").glob("*.safetensors")))
+
+    def log(self, process: str) -> str:
+        """Its log, in which the older part is in another file."""
+        logs = sorted((self.folder / "logs").glob(f"{process}.log*"), reverse=True)
+        return "".join(path.read_text(errors="replace") for path in logs)
 
     def is_complete(self) -> bool:
         counted = self.counted()
@@ -123,23 +161,46 @@ class FaultyRun:
 
 
 @pytest.mark.faults
-@pytest.mark.timeout(60 * 60)
+@pytest.mark.timeout(60 * 60 + 30 * FAULTS)
 def test_nothing_is_lost_by_random_faults(tmp_path: Path) -> None:
     run = FaultyRun(tmp_path)
+    began_s = time.monotonic()
+    held = [(0.0, 0)]
     try:
         while run.done.total() < FAULTS:
             run.fault()
             run.pause()
             assert run.process.poll() is None, run.output.read_text()
+            if run.done.total() in (FAULTS // 3, FAULTS):
+                held.append(run.held())
+        under_faults = len(run.counted()), len(run.recorded()), run.versions()
         run.calm()
-        eventually(run.is_complete, "the run is complete", patience_s=900)
-        run.process.send_signal(signal.SIGINT)
-        assert run.process.wait(120) == 0
+        eventually(run.is_complete, "the run is complete", patience_s=1800)
+        run.stop()
     finally:
         run.calm()
         run.process.kill()
-    print(f"seed {SEED}, faults: {dict(run.done)}")
+    print(f"seed {SEED}, {run.done.total()} faults in {time.monotonic() - began_s:.0f} s", run.done)
+    counted, recorded, versions = under_faults
+    print(f"while they came: {counted} trials counted, {recorded} recorded, policies {versions}")
+    print(f"in all: {len(run.counted())} trials counted, {len(run.recorded())} rollouts recorded,")
+    print(f"{len(run.shown())} sequences stored; run_local held (MiB, open files): {held[1:]}")
+    assert held[-1][0] < held[1][0] + 16, "its memory stays flat"
+    assert held[-1][1] < held[1][1] + 8, "it leaks no file"
 
+    check_trials(run)
+    check_sequences(run)
+    check_policies(run)
+    assert not run.pids(), "no process is left"
+    assert not list(run.temporary.iterdir()), "no temporary file is left"
+    report = check_run(run.folder)
+    print(report.counts, report.notes)
+    assert report.findings == []
+    assert not messages_of_run(run.folder), "all episodes that were finished are stored"
+
+
+def check_trials(run: FaultyRun) -> None:
+    """Each trial is counted once, and a recount from the recordings gives the same."""
     counted = run.counted()
     each = Counter((trial["policy_version"], trial["seed"]) for trial in counted)
     assert set(each.values()) == {1}, "each trial is counted once"
@@ -151,16 +212,31 @@ def test_nothing_is_lost_by_random_faults(tmp_path: Path) -> None:
         recorded = read_episode(file)
         assert (recorded.policy_version, recorded.seed) == (trial["policy_version"], trial["seed"])
         assert recorded.outcome.precise == trial["outcome"]["precise"]
-    shown = [read_episode(path).seed for path in (run.folder / "tutoring").glob("*.mcap")]
-    assert sorted(shown) == [1000 * case for case in CASES], "each case is stored once"
+    episodes = Counter(path.stem.rpartition("_")[2] for path in run.recorded())
+    assert set(episodes.values()) == {1}, "each rollout is recorded once"
+
+
+def check_sequences(run: FaultyRun) -> None:
+    """Each case is stored once, and each correction, unless it killed its actors three times."""
+    stored = [read_episode(path) for path in run.shown()]
+    shown = [each.seed for each in stored if each.kind is Kind.TUTORING]
+    given_up = re.findall(
+        r"the tutoring of \S+ with the seed (\d+) is given up", run.log("learner")
+    )
+    assert sorted([*shown, *map(int, given_up)]) == [1000 * case for case in CASES]
+    corrected = [each for each in stored if each.kind is Kind.CORRECTION]
+    once = Counter((each.policy_version, each.seed) for each in corrected)
+    assert set(once.values()) == {1}, "each correction is stored once"
+    assert set(Counter(version for version, _ in once).values()) <= {1, 2, 3}
+
+
+def check_policies(run: FaultyRun) -> None:
+    """All versions are there, and none was published after a newer one."""
     versions = [
         load_checkpoint(path).metadata.version
-        for path in sorted((run.folder / "policies").iterdir())
+        for path in sorted((run.folder / "policies").glob("*.safetensors"))
     ]
     assert versions == list(range(1, VERSIONS + 1))
-    log = "".join(path.read_text() for path in sorted((run.folder / "logs").glob("learner.log*")))
-    published = [int(number) for number in re.findall(r"policy (\d+) is published", log)]
-    assert published == sorted(published), "versions never go back"
-    wrong = {".damaged", ".refused", ".part"}
-    left = [path for path in run.folder.rglob("*") if path.suffix in wrong]
-    assert left == []
+    published = re.findall(r"policy (\d+) is published", run.log("learner"))
+    numbers = list(map(int, published))
+    assert numbers == sorted(numbers), "versions never go back"

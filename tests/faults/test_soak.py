@@ -26,14 +26,16 @@ from proto.bus import open_bus
 from proto.config import HubConfig
 from proto.keys import Role
 from proto.metrics import ActorMetrics
-from services.board import Board
+from services.board import FORGET_AFTER_S, Board
 
 MINUTES = float(os.environ.get("VMDNN_SOAK_MINUTES", "30"))
 SEED = int(os.environ.get("VMDNN_FAULT_SEED", "1"))
 MOST_ACTORS = 12
 LOOK_EVERY_S = 2.0
-CHANGE_EVERY_S = max(30.0, 3 * MINUTES)
-"""How long the wanted number of actors stays the same."""
+STAY_S = 20.0
+"""How long the number of actors stays the same, once all are there."""
+STARTING = 3
+"""So many actors start at the same time, at most: each needs some seconds of a processor."""
 GROWTH_MIB = 16.0
 """Growth of a process from the second third to the last third that is no leak."""
 GROWTH = 0.05
@@ -62,9 +64,11 @@ class Soak:
         self.endpoint = free_endpoint()
         self._chance = random.Random(SEED)
         self._guests: list[subprocess.Popen[bytes]] = []
+        self._numbers: list[int] = []
         self._wanted = 0
-        self._change_at_s = 0.0
+        self._there_since_s: float | None = None
         self.came = 0
+        self.numbers: list[int] = []
         self.mib: dict[str, list[tuple[float, float]]] = defaultdict(list)
         settings = {**SETTINGS, "run.folder": folder, "hub.endpoint": self.endpoint}
         self._words = [
@@ -83,13 +87,24 @@ class Soak:
             process.send_signal(signal.SIGINT)
             process.wait(180)
 
-    def come_or_go(self, at_s: float) -> None:
-        """Start an actor, or stop or kill one: from one to twelve, with the run's own."""
+    def come_or_go(self, at_s: float, there: int) -> None:
+        """Start an actor, or stop or kill one: from one to twelve, with the run's own.
+
+        Args:
+            at_s: time since the beginning (s).
+            there: number of actors that take part in the run.
+        """
         self._guests = [guest for guest in self._guests if guest.poll() is None]
-        if at_s >= self._change_at_s:
-            self._change_at_s = at_s + CHANGE_EVERY_S
-            self._wanted = (self._wanted + self._chance.randrange(4, MOST_ACTORS)) % MOST_ACTORS
-        if len(self._guests) < self._wanted:
+        if there != 1 + self._wanted:
+            self._there_since_s = None
+        elif self._there_since_s is None:
+            self._there_since_s = at_s
+            self.numbers.append(there)
+        elif at_s - self._there_since_s >= STAY_S:
+            self._numbers = self._numbers or self._chance.sample(range(MOST_ACTORS), MOST_ACTORS)
+            self._wanted = self._numbers.pop()
+        starting = 1 + len(self._guests) - there
+        if len(self._guests) < self._wanted and starting < STARTING:
             self.came += 1
             name = f"guest-{self.came}"
             command = (sys.executable, "-m", "services.cli", "actor", "--id", name, *self._words)
@@ -130,19 +145,21 @@ def test_memory_stays_flat_while_actors_come_and_go(tmp_path: Path) -> None:
             ahead_s = 0.0
             board = Board(bus, clock=lambda: now_s() + ahead_s)
             began_s = now_s()
-            most = 0
+            shown = 0
             while (at_s := now_s() - began_s) < MINUTES * 60:
-                soak.come_or_go(at_s)
+                view = board.view()
+                soak.come_or_go(at_s, len(view.living(ActorMetrics)))
                 soak.measure(at_s)
-                most = max(most, len(board.view().living(ActorMetrics)))
+                shown = max(shown, len(view.vanished_s))
                 time.sleep(LOOK_EVERY_S)
             assert process.poll() is None
-            gone = len(board.view().vanished_s)
-            ahead_s = 3600.0
+            now, gone = time.time(), board.view().vanished_s.values()
+            assert all(now - each < FORGET_AFTER_S + 60 for each in gone)
+            ahead_s = 2 * FORGET_AFTER_S
             assert len(board.view().vanished_s) == 0, "who is gone for good leaves the view"
-    print(f"{MINUTES:g} min, seed {SEED}: {soak.came} actors came, up to {most} at a time")
-    assert most > 2
-    print(f"{gone} of them were gone at the end")
+    print(f"{MINUTES:g} min, seed {SEED}: {soak.came} actors came; there were {soak.numbers}")
+    print(f"{len(gone)} that are gone were shown at the end, {shown} at most")
+    assert max(soak.numbers) > min(soak.numbers)
     lasting = {
         name: measured
         for name, measured in soak.mib.items()

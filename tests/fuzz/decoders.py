@@ -52,7 +52,7 @@ from proto.recordings.recovery import recover
 from proto.suites import Conditions, Player
 from services.exchange.eipl import import_eipl
 from services.exchange.joint_map import read_joint_map
-from services.exchange.lerobot import export_lerobot, import_lerobot
+from services.exchange.lerobot import export_lerobot, read_lerobot
 from services.trials.trial_log import CountedTrial, TrialLog, parse_line
 
 SMALL_NETWORK = (
@@ -281,11 +281,15 @@ LEROBOT_FILES = (
 )
 
 
+LEROBOT_VIDEO = "videos/observation.images.eye/chunk-000/file-000.mp4"
+
+
 @cache
-def _lerobot_set(folder: Path) -> dict[str, bytes]:
+def _lerobot_set(folder: Path, *, videos: bool = False) -> dict[str, bytes]:
     episode = replace(small_episode(2), targets=np.tile(_middles(), (2, 1)))
-    export_lerobot([episode], folder / "set", period_s=0.1, videos=False)
-    return {name: (folder / "set" / name).read_bytes() for name in LEROBOT_FILES}
+    export_lerobot([episode], folder / "set", period_s=0.1, videos=videos)
+    names = (*LEROBOT_FILES, LEROBOT_VIDEO) if videos else LEROBOT_FILES
+    return {name: (folder / "set" / name).read_bytes() for name in names}
 
 
 def _lerobot_files(folder: Path) -> list[bytes]:
@@ -296,11 +300,19 @@ def _lerobot_files(folder: Path) -> list[bytes]:
 
 def _read_lerobot(content: bytes, folder: Path) -> None:
     """The first byte says which file of the data set the rest replaces."""
-    files = _lerobot_set(folder)
     name = LEROBOT_FILES[(content or b"\0")[0] % len(LEROBOT_FILES)]
-    _file(content[1:], folder / "set", name)
+    _read_set(name, content[1:], folder, _lerobot_set(folder))
+
+
+def _read_video(content: bytes, folder: Path) -> None:
+    _read_set(LEROBOT_VIDEO, content, folder, _lerobot_set(folder, videos=True))
+
+
+def _read_set(name: str, content: bytes, folder: Path, files: dict[str, bytes]) -> None:
+    """Read a data set in which a file has another content."""
+    _file(content, folder / "set", name)
     try:
-        for _ in import_lerobot(folder / "set", None, "experiment1"):
+        for _ in read_lerobot(folder / "set", None, "experiment1"):
             pass
     finally:
         _file(files[name], folder / "set", name)
@@ -343,6 +355,12 @@ DECODERS: dict[str, Decoder] = {
         (UserError,),
         0.01,
     ),
-    "eipl": Decoder(_read_eipl, _eipl_files, (UserError,), 0.015),
+    "eipl": Decoder(_read_eipl, _eipl_files, (UserError,), 0.01),
     "lerobot": Decoder(_read_lerobot, _lerobot_files, (UserError,), 0.005),
+    "lerobot videos": Decoder(
+        _read_video,
+        lambda folder: [_lerobot_set(folder, videos=True)[LEROBOT_VIDEO]],
+        (UserError,),
+        0.005,
+    ),
 }

@@ -511,11 +511,12 @@ def test_damaged_checkpoint_policy_and_run_id_lose_no_version(setup: LearnerSetu
     setup.process.kill()
     setup.process.wait()
     policies = setup.folder / "policies"
-    published = {path: path.read_bytes() for path in policies.iterdir()}
+    published = {path: path.read_bytes() for path in policies.glob("*.safetensors")}
     newest = max(published)
     run_id = setup.policies[-1].run_id
-    del published[newest]
-    newest.write_bytes(b"damaged")
+    weights = bytearray(published.pop(newest))
+    weights[-1000] ^= 1
+    newest.write_bytes(weights)
     training = training_file(setup.folder)
     training.write_bytes(b"damaged")
     training.with_name("run_id").write_bytes(b"")
@@ -529,6 +530,6 @@ def test_damaged_checkpoint_policy_and_run_id_lose_no_version(setup: LearnerSetu
     assert first < int(newest.stem) < second
     assert setup.policies[0].run_id != run_id, "the id of the training is lost"
     assert setup.wait_for_metrics(lambda metrics: metrics.damaged == 1).policy_version >= second
-    assert newest.with_suffix(".damaged").read_bytes() == b"damaged"
+    assert newest.with_suffix(".damaged").read_bytes() == weights
     assert not half.exists()
     assert {path: path.read_bytes() for path in published} == published

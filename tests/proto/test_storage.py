@@ -14,6 +14,7 @@ from proto.storage import (
     append_line,
     change_suffix,
     drop_unfinished_line,
+    link_file,
     make_folder,
     parts_in,
     storage_errors,
@@ -113,3 +114,15 @@ def test_a_folder_that_cannot_be_used_is_named(tmp_path: Path) -> None:
             attempt()
     with pytest.raises(UserError, match="cannot be written: No such file"):
         change_suffix(tmp_path / "missing", ".other")
+
+
+def test_a_second_name_is_given_again_and_again(tmp_path: Path) -> None:
+    """Also when a process was killed before it replaced the file itself."""
+    path, other = tmp_path / "file", tmp_path / "other"
+    path.write_bytes(b"old")
+    link_file(path, other)
+    link_file(path, other)
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["file", "other"]
+    with written_whole(path) as stream:
+        stream.write(b"new")
+    assert other.read_bytes() == b"old"

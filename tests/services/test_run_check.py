@@ -19,6 +19,7 @@ from learner.checkpoint import (
     save_checkpoint,
     training_file,
 )
+from learner.policy_digests import note_digest
 from proto.codec import encode
 from proto.config import load_config
 from proto.episode import Episode, Kind
@@ -58,6 +59,8 @@ def run(tmp_path: Path, make_episode: Callable[..., Episode]) -> Path:
         path = policy_file(folder, version)
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(make_policy(version).weights)
+        if version < VERSIONS:  # older runs have no digests
+            note_digest(path, path.read_bytes())
     policy = checkpoint_from_bytes(make_policy(VERSIONS).weights, "it")
     training = TrainingMetadata(sequences=("s1",), asked={})
     metadata = policy.metadata.model_copy(update={"training": training})
@@ -191,6 +194,11 @@ def test_a_recording_that_waits_in_an_outbox_is_not_lost(run: Path) -> None:
             lambda r: flip(policy_file(r, 3), -1000),
             "policies/000003.safetensors",
             "differs from the checkpoint",
+        ),
+        (
+            lambda r: flip(policy_file(r, 2), -1000),
+            "policies/000002.safetensors",
+            "differs from its digest",
         ),
         (lambda r: cut(training_file(r)), "checkpoints/training.safetensors", "damaged"),
         (

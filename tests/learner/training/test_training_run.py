@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from actors.tasks.registry import make_task
 from learner.checkpoint import load_checkpoint, policy_file, previous_training_file, training_file
+from learner.policy_digests import DIGESTS
 from learner.training.trainer import Trainer
 from learner.training.training_run import open_training, run_training, save_training, write_policy
 from learner.training.vmdnn_recipe import VMDNNRecipe
@@ -48,7 +50,8 @@ def train(trainer: Trainer, folder: Path, epochs: int) -> None:
 
 
 def policies(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in policy_file(folder, 0).parent.iterdir()}
+    files = policy_file(folder, 0).parent.glob("*.safetensors")
+    return {path.name: path.read_bytes() for path in files}
 
 
 @pytest.mark.parametrize("fault", ["damaged", "empty", "gone"])
@@ -73,6 +76,9 @@ def test_the_checkpoint_before_is_used_and_policies_stay(
     assert before.items() <= after.items(), "what was published stays, bit for bit"
     assert sorted(after) == [f"{version:06d}.safetensors" for version in (1, 2, 3)]
     assert load_checkpoint(newest).metadata.version == 3
+    folder = policy_file(tmp_path, 0).parent
+    subprocess.run(("sha256sum", "--check", "--strict", DIGESTS), cwd=folder, check=True)
+    assert (folder / DIGESTS).read_text().count("\n") == 3
 
 
 def test_another_policy_of_the_same_version_is_not_overwritten(

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import random
 import signal
+import subprocess
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -142,6 +146,44 @@ def test_ctrl_c_saves_and_the_same_command_continues_exactly(
     assert train(disturbed) == 0
     for path in (training_file, lambda run: policy_file(run, 3)):
         assert path(disturbed).read_bytes() == path(undisturbed).read_bytes()
+
+
+KILLS = 10
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_training_that_is_killed_ten_times_ends_bit_for_bit_the_same(
+    tmp_path: Path, data: Path
+) -> None:
+    config, chance = tmp_path / "long.yaml", random.Random(1)
+    long = {"epochs": 3000, "publish_every_epochs": 250, "checkpoint_every_epochs": 20}
+    config.write_text(yaml.safe_dump({**CONFIG, "learner": {**CONFIG["learner"], **long}}))
+    disturbed, undisturbed = tmp_path / "disturbed", tmp_path / "undisturbed"
+    words = ("train", "--data", data, "--config", config, "--out")
+
+    def saved(since: int) -> bool:
+        return training_file(disturbed).exists() and saved_at() > since
+
+    def saved_at() -> int:
+        return training_file(disturbed).stat().st_mtime_ns
+
+    before = 0
+    for _ in range(KILLS):
+        with vmdnn(*words, disturbed) as process:
+            eventually(partial(saved, before), "a new checkpoint")
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(chance.uniform(0.0, 0.5))
+            assert process.poll() is None, "it is killed before it has ended"
+        before = saved_at()
+    assert load_checkpoint(training_file(disturbed)).metadata.epoch < 3000
+    for folder in (disturbed, undisturbed):
+        with vmdnn(*words, folder) as process:
+            assert process.wait(300) == 0
+    policies = [partial(policy_file, version=version) for version in range(1, 13)]
+    for path in (training_file, pretraining_file, *policies):
+        assert path(disturbed).read_bytes() == path(undisturbed).read_bytes()
+    assert not list(disturbed.rglob("*.part"))
 
 
 def test_a_second_ctrl_c_ends_at_once(

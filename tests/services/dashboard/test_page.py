@@ -197,7 +197,7 @@ def test_the_video_of_a_failure_plays(browser: Browser, staged: StagedRun, failu
         page.locator("#rollouts tbody tr").click()
         video = page.locator("#video")
         expect(video).to_be_visible(timeout=4 * PATIENCE_MS)
-        assert video.evaluate("video => [video.videoWidth, video.videoHeight]") == [1280, 480]
+        assert video.evaluate("video => [video.videoWidth, video.videoHeight]") == [1280, 588]
         page.locator("#scrub").fill("0")
         page.locator("#play").click()
         expect(page.locator("#step")).to_have_text("20/20", timeout=PATIENCE_MS)
