@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from actors.attention import clip_action, targets_of_action, with_attention_of
-from actors.hand_control import HandControl, HandPlace
+from actors.hand_control import FamiliarPostures, HandControl, HandPlace
 from actors.kinematics import Gaze
 from actors.motion import minimum_jerk
 from actors.pointing import Camera, point_seen
@@ -124,8 +124,16 @@ class Demonstration:
         touched: names of the watched boxes that were touched.
     """
 
-    def __init__(self, simulator: Simulator, task: Task, situation: Situation) -> None:
+    def __init__(
+        self, simulator: Simulator, task: Task, situation: Situation, familiar: FamiliarPostures
+    ) -> None:
         """Put the robot into the situation.
+
+        Args:
+            simulator: plays the scene.
+            task: the task.
+            situation: values of the task's variables by name.
+            familiar: postures that the arm prefers.
 
         Raises:
             UserError: the situation is not valid for the task.
@@ -137,7 +145,7 @@ class Demonstration:
         self._simulator = simulator
         self._task = task
         self._scene = task.scene(situation)
-        self._hand = HandControl(self._scene)
+        self._hand = HandControl(self._scene, familiar)
         self._gaze = Gaze(self._scene.table_drop_m)
         self._actions: list[Array] = []
         self._phases: list[int] = []

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from actors.attention import crop_of_focus
+from actors.hand_control import FamiliarPostures
 from actors.player import LiveStep, play
 from actors.pointing import OUTSIDE_HEIGHT, OUTSIDE_WIDTH
 from actors.simulator import EYE_HEIGHT, EYE_WIDTH, Crop, Simulator, make_simulator
@@ -147,6 +148,7 @@ class Robot:
 
     def _work(self, simulator: Simulator) -> None:
         self._simulator = simulator
+        self._familiar = FamiliarPostures.of_tutor(self._task)
         self._begin()
         while True:
             self._tell_state(busy=False)
@@ -227,7 +229,9 @@ class Robot:
     def _begin(self) -> None:
         case = self._cases[self._case]
         self._played = None
-        self._demonstration = Demonstration(self._simulator, self._task, case.situation)
+        self._demonstration = Demonstration(
+            self._simulator, self._task, case.situation, self._familiar
+        )
 
     def _next_case(self) -> None:
         self._case = (self._case + 1) % len(self._cases)

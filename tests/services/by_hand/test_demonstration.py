@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from actors.hand_control import FamiliarPostures
 from actors.player import play
 from actors.simulator import Simulator, make_simulator
 from actors.tasks.contract import Task
@@ -46,9 +47,14 @@ def simulator() -> Iterator[Simulator]:
     made.close()
 
 
+@pytest.fixture(scope="module")
+def familiar(task: Task) -> FamiliarPostures:
+    return FamiliarPostures.of_tutor(task)
+
+
 @pytest.fixture
-def shown(simulator: Simulator, task: Task) -> Demonstration:
-    return Demonstration(simulator, task, task.tutored()[0])
+def shown(simulator: Simulator, task: Task, familiar: FamiliarPostures) -> Demonstration:
+    return Demonstration(simulator, task, task.tutored()[0], familiar)
 
 
 def obey(shown: Demonstration, *commands: Command) -> int:
