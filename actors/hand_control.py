@@ -72,8 +72,8 @@ class HandPlace:
 class FamiliarPostures:
     """Postures of the arm in which it has been before, by the place of the hand.
 
-    An arm with seven joints can bring the hand to a place in many postures, and from most of them it
-    cannot go on: joints are at their limits. Those of a tutor lead to where a task needs the hand.
+    Seven joints can bring the hand to a place in many postures. From most of them the arm cannot go
+    on, because joints are at their limits. A tutor's lead to where a task needs the hand.
     """
 
     def __init__(self, arm: Arm, postures_rad: Array) -> None:
