@@ -108,23 +108,25 @@ def test_one_person_at_a_time_and_nothing_is_lost(tmp_path: Path) -> None:
 
 def test_a_correction_is_recorded(tmp_path: Path) -> None:
     folder = tmp_path / "shown"
-    with tutoring(folder, "--cases", "23", "--policy", "replay") as address:
-        with connect(address.replace("http", "ws") + "/robot") as browser:
-            ask(browser, 0, "pace", factor=0)
-            begun = told(browser, is_done(0))
-            assert (begun["kind"], begun["policy"]) == ("correction", "replay, version 0")
-            ask(browser, 1, "act")
-            told(browser, lambda told: told["topic"] == "robot" and told["steps"] >= REPLAYED)
-            ask(browser, 2, "move", turn=-20)  # it takes over from the policy
-            taken = told(browser, is_done(2))
-            assert taken["corrected"]
-            assert taken["can_act"]
-            ask(browser, 3, "act")
-            told(browser, is_done(3))
-            ask(browser, 4, "finish")
-            assert told(browser, is_done(4))["outcome"] is not None
-            ask(browser, 5, "keep")
-            assert told(browser, is_done(5))["kept"] == 1
+    with (
+        tutoring(folder, "--cases", "23", "--policy", "replay") as address,
+        connect(address.replace("http", "ws") + "/robot") as browser,
+    ):
+        ask(browser, 0, "pace", factor=0)
+        begun = told(browser, is_done(0))
+        assert (begun["kind"], begun["policy"]) == ("correction", "replay, version 0")
+        ask(browser, 1, "act")
+        told(browser, lambda told: told["topic"] == "robot" and told["steps"] >= REPLAYED)
+        ask(browser, 2, "move", turn=-20)  # it takes over from the policy
+        taken = told(browser, is_done(2))
+        assert taken["corrected"]
+        assert taken["can_act"]
+        ask(browser, 3, "act")
+        told(browser, is_done(3))
+        ask(browser, 4, "finish")
+        assert told(browser, is_done(4))["outcome"] is not None
+        ask(browser, 5, "keep")
+        assert told(browser, is_done(5))["kept"] == 1
     (recorded,) = folder.glob("*.mcap")
     episode = read_episode(recorded)
     assert (episode.kind, episode.policy) == (Kind.CORRECTION, "by-hand")
