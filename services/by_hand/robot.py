@@ -33,8 +33,11 @@ from services.dashboard.feed import Feed, jpeg, outcome_content, situation_conte
 
 PICTURE_PERIOD_S: Final = 0.15
 """Least time between two pictures while the robot moves."""
+MOVING: Final = 3.0
+"""While it moves, the robot takes at least so many times as long for it as for pictures."""
 SHOW_AFTER_S: Final = 0.08
-"""When nothing is asked for this time, the robot shows what it has come to."""
+"""When nothing is asked for this time, or for as long as it takes to render pictures, the robot
+shows what it has come to."""
 _LOOK_AGAIN_S: Final = 0.5
 
 
@@ -63,6 +66,7 @@ class Robot:
         self._familiar: dict[str, FamiliarPostures] = {}
         self._shows = False
         self._pictures_due_s = 0.0
+        self._rendering_s = 0.0
         self._wanted: tuple[int, Request] | None = None
         self._after: tuple[int, Request] | None = None
         self._changed = threading.Condition()
@@ -149,7 +153,7 @@ class Robot:
         while True:
             self._tell_state(busy=False)
             # A request that follows at once, as while a key is held, need not wait for pictures.
-            if not self._is_asked(within_s=SHOW_AFTER_S):
+            if not self._is_asked(within_s=max(SHOW_AFTER_S, self._rendering_s)):
                 self._show()
                 self._is_asked()
             if self._wanted is None:
@@ -305,6 +309,7 @@ class Robot:
 
     def _show(self, playing: LiveStep | None = None) -> None:
         """Render all pictures, and tell them."""
+        begun_s = time.monotonic()
         if playing is None:
             crop = crop_of_focus(float(self._demonstration.action[FOCUS]))
         else:
@@ -322,7 +327,9 @@ class Robot:
                 "crop": round(crop.width / EYE_WIDTH, 4),
             },
         )
-        self._pictures_due_s = time.monotonic() + PICTURE_PERIOD_S
+        shown_s = time.monotonic()
+        self._rendering_s = shown_s - begun_s
+        self._pictures_due_s = shown_s + max(PICTURE_PERIOD_S, MOVING * self._rendering_s)
 
     def _state(self, *, busy: bool, playing: LiveStep | None) -> dict[str, Any]:
         shown, now, asked = self._demonstration, self._demonstration.action, self._asked

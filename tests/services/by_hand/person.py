@@ -12,7 +12,7 @@ from typing import Final
 
 from playwright.sync_api import Page
 
-PATIENCE_S: Final = 120.0
+PATIENCE_S: Final = 600.0
 COARSE_CM, FINE_CM = 2.0, 0.4
 COARSE_DEG, FINE_DEG = 10.0, 2.0
 KEYS: Final = (("d", "a"), ("w", "s"), ("r", "f"))
@@ -61,12 +61,12 @@ class Person:
         self.bring(*_behind(right, forward, yaw, 3), up=11, yaw=yaw, tolerance=0.6)
         self.bring(*_behind(right, forward, yaw, 2), up=10, yaw=yaw, tolerance=0.4)
         self.next_phase()  # reach above object
-        self.press("+", times=19)
+        self.hold("+", until="document.getElementById('focus').textContent === '20.0'")
         self.bring(*_behind(right, forward, yaw, 1), up=8.5, yaw=yaw)
         for height in (6.5, 3.7):
             self.bring(right, forward, height, yaw)
         self.next_phase()  # descend
-        self.press("g", times=9)
+        self.hold("g", until="document.getElementById('grasp').textContent === '10.0'")
         self.next_phase()  # grasp
         self.bring(up=15, tolerance=0.6)
         self.press("Enter")
@@ -75,11 +75,17 @@ class Person:
     def next_phase(self) -> None:
         self.press("n")
 
-    def press(self, key: str, times: int = 1) -> None:
+    def press(self, key: str) -> None:
         """Press a key and wait until the robot has done what it stands for."""
-        for _ in range(times):
-            self.page.keyboard.press(key)
-            self.wait()
+        self.page.keyboard.press(key)
+        self.wait()
+
+    def hold(self, key: str, *, until: str) -> None:
+        """Hold a key until the page shows something."""
+        self.page.keyboard.down(key)
+        self.wait_until(until)
+        self.page.keyboard.up(key)
+        self.wait()
 
     def wait(self) -> None:
         """Wait until the robot is not busy."""
