@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import eventually, stop, vmdnn
+from ports import free_endpoint
+from processes import eventually, listening_hub, stop, vmdnn
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
@@ -19,6 +20,7 @@ from proto.episode import Kind
 from proto.recordings.episodes import read_episode
 from services.cli import main
 
+MINUTES_S = 600.0
 REPLAYED = 72
 """Control steps after which the hand is above the object."""
 
@@ -38,7 +40,7 @@ def tutoring(folder: Path, *words: str) -> Iterator[str]:
 def told(browser: ClientConnection, reached: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
     """Wait until something is told."""
     while True:
-        content: dict[str, Any] = json.loads(browser.recv(timeout=60))
+        content: dict[str, Any] = json.loads(browser.recv(timeout=MINUTES_S))
         if reached(content):
             return content
 
@@ -130,6 +132,71 @@ def test_a_correction_is_recorded(tmp_path: Path) -> None:
     (recorded,) = folder.glob("*.mcap")
     episode = read_episode(recorded)
     assert (episode.kind, episode.policy) == (Kind.CORRECTION, "by-hand")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+def test_the_learner_keeps_what_it_asked_for(tmp_path: Path) -> None:
+    """A case, and a correction of the policy that was trained on it."""
+    settings = {
+        "run.name": "asked",
+        "run.folder": tmp_path,
+        "simulator.backend": "mujoco",
+        "tutor.repeats": 1,
+        "learner.cases": [23],
+        "learner.start_sequences": 1,
+        "learner.pretraining.epochs": 0,
+        "learner.epochs": 2,
+        "learner.publish_every_epochs": 2,
+        "learner.corrections": {"rounds": 1, "choose": "random", "sequences": 1, "epochs": 1},
+    }
+    endpoint, log = free_endpoint(), tmp_path / "tutor.log"
+    words = ["--connect", endpoint]
+    for key, value in settings.items():
+        words += ["--set", f"{key}={value}"]
+    with (
+        listening_hub(endpoint, "--set", "run.name=asked"),
+        vmdnn("learner", *words, log=tmp_path / "learner.log") as learner,
+        vmdnn("tutor", "--by-hand", "--port", "0", *words, log=log) as tutor,
+    ):
+        eventually(lambda: "(Ctrl-C ends)" in log.read_text(), "its address", MINUTES_S)
+        (address,) = re.findall(r"http://\S+", log.read_text())
+        with connect(address.replace("http", "ws") + "/robot") as browser:
+            ask(browser, 0, "pace", factor=0)
+            assert told(browser, is_done(0))["kind"] == "tutoring"
+            for number in range(1, 8):
+                ask(browser, number, "next")
+                told(browser, is_done(number))
+            ask(browser, 8, "move", z=0.02)
+            told(browser, is_done(8))
+            ask(browser, 9, "finish")
+            told(browser, is_done(9))
+            ask(browser, 10, "keep")
+            asked = told(browser, lambda told: told.get("kind") == "correction")
+            assert (asked["can_act"], asked["kept"]) == (True, 1)
+            ask(browser, 11, "act")
+            told(browser, lambda told: told.get("steps", 0) >= REPLAYED)
+            ask(browser, 12, "move", z=0.02)
+            told(browser, is_done(12))
+            ask(browser, 13, "act")
+            told(browser, is_done(13))
+            ask(browser, 14, "finish")
+            assert told(browser, is_done(14))["problem"] == ""
+            ask(browser, 15, "keep")
+            folder = tmp_path / "asked"
+            eventually(
+                lambda: (folder / "policies" / "000002.safetensors").exists(),
+                "a policy that has learned from the correction",
+                MINUTES_S,
+            )
+        assert stop(tutor) == 0, log.read_text()
+        assert stop(learner) == 0
+    kept = [read_episode(file) for file in (folder / "tutoring").glob("*.mcap")]
+    assert {(each.kind, each.policy, each.policy_version) for each in kept} == {
+        (Kind.TUTORING, "by-hand", 0),
+        (Kind.CORRECTION, "by-hand", 1),
+    }
+    assert not list((folder / "outbox").glob("*/*/*"))
 
 
 def test_a_taken_port_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
