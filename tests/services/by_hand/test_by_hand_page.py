@@ -185,7 +185,7 @@ def test_the_learner_keeps_what_it_asked_for(tmp_path: Path) -> None:
             ask(browser, 15, "keep")
             folder = tmp_path / "asked"
             eventually(
-                lambda: (folder / "policies" / "000002.safetensors").exists(),
+                (folder / "policies" / "000002.safetensors").exists,
                 "a policy that has learned from the correction",
                 MINUTES_S,
             )
