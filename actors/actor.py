@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from actors.policies.contract import Policy
 from actors.policies.guided import GuidedPolicy
 from actors.policies.planned import make_tutor
 from actors.receipts import Receipts
-from actors.simulator import Crop, make_simulator, player_of
+from actors.simulator import Crop, Simulator, make_simulator, player_of
 from actors.tasks.contract import Task
 from actors.tasks.registry import make_task
 from actors.view import focal_lengths, view_of
@@ -186,6 +186,23 @@ def _encoded(message: object) -> Wire:
         raise _SimulationError(str(error)) from error
 
 
+class Shower(Protocol):
+    """Has a person show what the learner asks for."""
+
+    def show(
+        self, simulator: Simulator, assignment: Assignment, actor: str, config_digest: str
+    ) -> Episode | None:
+        """Let a person show an episode; None if they do not want to, or the actor should stop.
+
+        Args:
+            simulator: plays the scene.
+            assignment: what is to be shown. Its policy acts where the person lets it, if it is a
+                correction.
+            actor: id of the actor.
+            config_digest: digest of the actor's settings.
+        """
+
+
 class Actor:
     """Plays one episode after another, and keeps each on disk until its receipt comes.
 
@@ -201,6 +218,7 @@ class Actor:
         *,
         backend: str | None = None,
         drain_s: float = 0.0,
+        shower: Shower | None = None,
     ) -> None:
         """Make the simulator, and find the messages that a former process with this id left.
 
@@ -210,6 +228,7 @@ class Actor:
             lifecycle: says when to pause and to stop.
             backend: name of this actor's simulator; None for `simulator.backend`.
             drain_s: how long it waits for receipts before it ends (s).
+            shower: has a person show what the learner asks for; this actor then plays nothing else.
 
         Raises:
             UserError: the simulator cannot run on this machine, or the run's folder cannot be
@@ -219,6 +238,7 @@ class Actor:
         self._bus = bus
         self._lifecycle = lifecycle
         self._drain_s = drain_s
+        self._shower = shower
         self._agreement = Agreement(config, bus)
         self._serving: set[tuple[Role, str]] = set()  # learners and evaluators that are there
         self._joined = threading.Event()  # set when a learner or evaluator has joined
@@ -357,8 +377,7 @@ class Actor:
     def _play_next(self) -> None:
         assignment = None
         if not self._lifecycle.paused and self._agrees():
-            first = self._first_trial()
-            assignment = first or self._tutoring() or self._trial() or self._practice()
+            assignment = self._next_assignment()
         if assignment is None:
             if self._unserved:
                 self._lifecycle.waits_for(self._unserved, log_again_s=UNSERVED_S)
@@ -383,6 +402,14 @@ class Actor:
             *(episode.kind, episode.seed, episode.policy, episode.policy_version),
             episode.outcome.reason,
         )
+
+    def _next_assignment(self) -> Assignment | None:
+        if self._shower is not None:
+            while self._offers:
+                self._take_next_policy()
+            return self._tutoring()
+        first = self._first_trial()
+        return first or self._tutoring() or self._trial() or self._practice()
 
     def _agrees(self) -> bool:
         """Whether the settings still fit the run; compared when a learner or evaluator joined."""
@@ -466,7 +493,7 @@ class Actor:
         return Assignment(Kind.TUTORING, task, tutor, situations[asked.case], asked.seed)
 
     def _guidance(self, asked: Correction) -> Assignment:
-        """A correction: the policy acts and the tutor guides it.
+        """A correction: the policy acts, and the tutor or a person guides it.
 
         Raises:
             UserError: there is no policy, or the situation is not one of the task.
@@ -477,8 +504,10 @@ class Actor:
         )
         if self._policy is None:
             raise UserError("there is no policy to be guided")
-        tutor = make_tutor(task)
-        guided = GuidedPolicy(self._policy, tutor, self._config.tutor.guidance_deg)
+        guided: Policy = self._policy
+        if self._shower is None:
+            guidance_deg = self._config.tutor.guidance_deg
+            guided = GuidedPolicy(self._policy, make_tutor(task), guidance_deg)
         return Assignment(
             Kind.CORRECTION,
             task,
@@ -561,6 +590,12 @@ class Actor:
         )
 
     def _play(self, assignment: Assignment) -> Episode:
+        if self._shower is not None:
+            digest = self._agreement.digest
+            shown = self._shower.show(self._simulator, assignment, self._bus.id, digest)
+            if shown is None:
+                raise _StoppedError
+            return shown
         live_key = self._bus.keys.live(self._bus.id)
 
         def on_step(live: LiveStep) -> None:

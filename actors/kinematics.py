@@ -6,6 +6,7 @@ All positions are in the world frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Final
 
 import numpy as np
@@ -124,12 +125,19 @@ class Arm:
         )
 
     def _collider_clouds(self, colliders: tuple[Collider, ...]) -> list[tuple[int, Array, Array]]:
+        """Return points of each moving joint's colliders, in its frame, and their radii."""
         clouds = []
-        for collider in colliders:
-            frame = self._model.frames[self._model.getFrameId(collider.link)]
-            points, radius = _sample(collider)
-            placed = points @ frame.placement.rotation.T + frame.placement.translation
-            clouds.append((frame.parentJoint, placed, np.full(len(points), radius)))
+        framed = [
+            (self._model.frames[self._model.getFrameId(collider.link)], collider)
+            for collider in colliders
+        ]
+        for joint, parts in groupby(framed, lambda part: part[0].parentJoint):
+            points, radii = [], []
+            for frame, collider in parts:
+                sampled, radius = _sample(collider)
+                points.append(sampled @ frame.placement.rotation.T + frame.placement.translation)
+                radii.append(np.full(len(sampled), radius))
+            clouds.append((joint, np.concatenate(points), np.concatenate(radii)))
         return clouds
 
     def pose(self, posture_rad: Array) -> ArmPose:

@@ -10,14 +10,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from actors.attention import clip_action, targets_of_action, with_attention_of
-from actors.hand_control import HandControl, HandPlace
+from actors.attention import (
+    clip_action,
+    crop_of_focus,
+    targets_of_action,
+    with_attention_of,
+)
+from actors.hand_control import FamiliarPostures, HandControl, HandPlace
 from actors.kinematics import Gaze
 from actors.motion import minimum_jerk
 from actors.pointing import Camera, point_seen
+from actors.policies.contract import Policy
 from actors.simulator import Simulator
 from actors.tasks.contract import Task
 from proto.body import ARM, FOCUS, GRASP, NECK
+from proto.episode import Image
 from proto.errors import UserError
 from proto.variables import Situation
 from services.by_hand.resampling import resample
@@ -33,6 +40,9 @@ _NEAR_DEG: Final = 1.0
 _ASTRAY_M: Final = 0.01
 _ASTRAY_DEG: Final = 5.0
 _STILL_DEG: Final = 0.05
+_CHANGED: Final = 0.01
+"""A person has changed what the policy wants if a value of the action differs by more."""
+_FOLLOW_TRIES: Final = 3
 _MOVE_STEPS: Final = 12
 _REACH_STEPS: Final = 80
 
@@ -97,7 +107,12 @@ class NextPhase:
     """The next phase of the task begins."""
 
 
-Command = Look | Reach | TurnHead | MoveHand | Focus | Grasp | NextPhase
+@dataclass(frozen=True)
+class LetAct:
+    """The policy acts, until its episode is over or the command is interrupted."""
+
+
+Command = Look | Reach | TurnHead | MoveHand | Focus | Grasp | NextPhase | LetAct
 
 
 @dataclass(frozen=True)
@@ -106,26 +121,63 @@ class _State:
 
     Attributes:
         steps: number of control steps so far.
+        acted: number of steps of the policy so far.
+        alone: whether the person shows the rest alone.
         phase: index of the phase.
         wanted: where the hand should be.
     """
 
     steps: int
+    acted: int
+    alone: bool
     phase: int
     wanted: HandPlace
+
+
+@dataclass(frozen=True)
+class _Change:
+    """What a person has changed of what a policy does; it stays changed.
+
+    Attributes:
+        shift_m: (3,) where the hand is, seen from where the policy wants it.
+        turn_deg: how far it is turned from there about the vertical.
+        values: (11,) what is added to the other values of the action; 0 for the arm.
+    """
+
+    shift_m: Array
+    turn_deg: float
+    values: Array
 
 
 class Demonstration:
     """One demonstration. The simulator runs only while a command is obeyed.
 
+    With a policy it is a correction: the policy acts in the task's phases, a person takes over at
+    any time, and the policy goes on from there. What the person has changed stays changed: the hand
+    stays as far from where the policy wants it, and so do gaze, focus and grasp.
+
     Attributes:
         situation: the situation.
-        phase: index of the phase that the person is in.
+        phase: index of the phase that the person, or the policy, is in.
         touched: names of the watched boxes that were touched.
     """
 
-    def __init__(self, simulator: Simulator, task: Task, situation: Situation) -> None:
+    def __init__(
+        self,
+        simulator: Simulator,
+        task: Task,
+        situation: Situation,
+        familiar: FamiliarPostures,
+        policy: Policy | None = None,
+    ) -> None:
         """Put the robot into the situation.
+
+        Args:
+            simulator: plays the scene.
+            task: the task.
+            situation: values of the task's variables by name.
+            familiar: postures that the arm prefers.
+            policy: the policy that is corrected; None if the person shows everything.
 
         Raises:
             UserError: the situation is not valid for the task.
@@ -137,13 +189,32 @@ class Demonstration:
         self._simulator = simulator
         self._task = task
         self._scene = task.scene(situation)
-        self._hand = HandControl(self._scene)
+        self._hand = HandControl(self._scene, familiar)
         self._gaze = Gaze(self._scene.table_drop_m)
         self._actions: list[Array] = []
         self._phases: list[int] = []
         self._wanted = self._hand.place(task.start[ARM])
         self._states: list[_State] = []
+        self._policy = policy
+        self._seen: list[Image] = []
+        self._proposed = task.start
+        self._alone = False
+        self._restart_policy()
         simulator.reset(self._scene)
+
+    @property
+    def corrected(self) -> bool:
+        """Whether a person did something that the policy did not."""
+        return len(self._seen) < self.steps or self._alone
+
+    @property
+    def can_act(self) -> bool:
+        """Whether there is a policy that goes on when it is let."""
+        return (
+            self._policy is not None
+            and not self._alone
+            and len(self._seen) < len(self._task.phases)
+        )
 
     @property
     def action(self) -> Array:
@@ -178,12 +249,20 @@ class Demonstration:
         Raises:
             UserError: the command cannot be obeyed; the robot has not moved.
         """
-        before = _State(self.steps, self.phase, self._wanted)
+        before = _State(self.steps, len(self._seen), self._alone, self.phase, self._wanted)
         if isinstance(command, NextPhase):
             if self.in_last_phase:
                 raise UserError("this is the last phase: finish the demonstration")
             self.phase += 1
+            self._alone = True
             self._states.append(before)
+            return
+        if isinstance(command, LetAct):
+            acting = self._let_act()
+            next(acting)
+            self._states.append(before)
+            yield
+            yield from acting
             return
         moves = self._moves(command)
         self._states.append(before)
@@ -209,8 +288,12 @@ class Demonstration:
         if self._states:
             before = self._states.pop()
             self.phase, self._wanted = before.phase, before.wanted
+            self._alone = before.alone
             if before.steps < self.steps:
                 self._return_to(before.steps)
+            if before.acted < len(self._seen):
+                del self._seen[before.acted :]
+                self._restart_policy()
 
     def restart(self) -> None:
         """Go back to the start."""
@@ -226,8 +309,10 @@ class Demonstration:
         """Return the demonstration as actions (T, 11) of the task's phases.
 
         Raises:
-            UserError: a phase of the task was not begun yet.
+            UserError: a phase of the task was not begun yet, or a policy did everything.
         """
+        if self._policy is not None and not self.corrected:
+            raise UserError("the policy did all of this: nothing was corrected")
         if not self.in_last_phase:
             names = self._task.phase_names
             raise UserError(
@@ -237,6 +322,58 @@ class Demonstration:
         actions = np.array(self._actions).reshape(-1, len(self._task.start))
         durations = list(self._task.subtasks.values())
         return resample(actions, self._phases, durations, self._task.start)
+
+    def _restart_policy(self) -> None:
+        """Bring the policy to where it is after it saw the pictures that it has seen."""
+        self._proposed = self._task.start
+        if self._policy is not None:
+            self._policy.begin(self.situation, 0)
+            for image in self._seen:
+                self._proposed = self._allowed(self._policy.step(image))
+
+    def _let_act(self) -> Iterator[None]:
+        """Let the policy act from where the robot is.
+
+        Raises:
+            UserError: there is no policy, or it has done all.
+        """
+        policy = self._policy
+        if policy is None or not self.can_act:
+            raise UserError("no policy acts any more: show the rest, or undo")
+        change = self._change()
+        for phase in self._task.phases[len(self._seen) :]:
+            image = self._simulator.observe(crop_of_focus(float(self.action[FOCUS]))).image
+            before, self._proposed = self._proposed, self._allowed(policy.step(image))
+            self._seen.append(image)
+            self.phase = int(phase)
+            action = self._proposed if change is None else self._follow(before, change)
+            self._step(action, self.phase)
+            self._wanted = self.hand
+            yield
+
+    def _change(self) -> _Change | None:
+        """What the person has changed so far; None if nothing."""
+        values = self.action - self._proposed
+        if float(np.abs(values).max()) < _CHANGED:
+            return None
+        here, there = self.hand, self._hand.place(self._proposed[ARM])
+        values[ARM] = 0.0
+        return _Change(here.centre_m - there.centre_m, here.yaw_deg - there.yaw_deg, values)
+
+    def _follow(self, before: Array, change: _Change) -> Array:
+        """Do what the policy wants next (11,), changed as the person did.
+
+        Args:
+            before: (11,) what it wanted before.
+            change: what the person has changed.
+        """
+        action = self._proposed + change.values
+        there = self._hand.place(self._proposed[ARM]).moved(change.shift_m, change.turn_deg)
+        arm = clip_action(self.action + self._proposed - before)[ARM]
+        for _ in range(_FOLLOW_TRIES):
+            arm = self._hand.towards(arm, there)
+        action[ARM] = arm
+        return action
 
     def _return_to(self, steps: int) -> None:
         """Play the first control steps again; the others are forgotten."""
@@ -248,13 +385,18 @@ class Demonstration:
             self._step(action, phase)
 
     def _step(self, action: Array, phase: int) -> None:
-        action = clip_action(action)
-        if self._task.attention != "active":
-            action = with_attention_of(self._task.start, action)
+        action = self._allowed(action)
         report = self._simulator.step(targets_of_action(action))
         self.touched.update(box for box, _ in report.touches)
         self._actions.append(action)
         self._phases.append(phase)
+
+    def _allowed(self, action: Array) -> Array:
+        """Return an action (11,) within the robot's limits and the task's attention."""
+        action = clip_action(action)
+        if self._task.attention == "active":
+            return action
+        return with_attention_of(self._task.start, action)
 
     def _moves(self, command: Command) -> Iterator[Array]:
         """The actions that a command takes.

@@ -15,16 +15,20 @@ BY_HAND: Final = "by-hand"
 
 
 class ShownByHand:
-    """A `Policy` that repeats the actions of a demonstration, brought to the task's phases."""
+    """A `Policy` that repeats the actions of a demonstration, brought to the task's phases.
+
+    Attributes:
+        version: version of the policy that was corrected, 0 if there was none.
+    """
 
     name = BY_HAND
-    version = 0
     looks = False
     target: NDArray[np.float64] | None = None
     outputs: Floats | None = None
 
-    def __init__(self, actions: NDArray[np.float64]) -> None:
+    def __init__(self, actions: NDArray[np.float64], version: int) -> None:
         """Repeat actions (T, 11)."""
+        self.version = version
         self._actions = actions
         self._step = 0
 

@@ -1,49 +1,44 @@
-"""The robot that a person tutors: one thread owns the simulator and obeys one request at a time.
+"""The robot that a person tutors. It obeys one request at a time, and moves only while it obeys.
 
-It moves only while it obeys. It tells what there is to see through a `Feed`.
+It tells what there is to see through a `Feed`.
 """
 
 from __future__ import annotations
 
 import base64
-import logging
 import threading
 import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from itertools import count
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from actors.attention import crop_of_focus
+from actors.hand_control import FamiliarPostures
 from actors.player import LiveStep, play
 from actors.pointing import OUTSIDE_HEIGHT, OUTSIDE_WIDTH
-from actors.simulator import EYE_HEIGHT, EYE_WIDTH, Crop, Simulator, make_simulator
+from actors.simulator import EYE_HEIGHT, EYE_WIDTH, Crop, Simulator
 from actors.tasks.contract import Task
-from actors.tasks.registry import make_task
+from actors.tasks.grasp_reading import yaw_deg
 from proto.acceptance import misfit
 from proto.body import FOCUS, GRASP
-from proto.config import Config
-from proto.episode import Episode, Kind
+from proto.episode import Episode
 from proto.errors import UserError
-from proto.messages import TutoringCase
+from proto.lifecycle import Lifecycle
 from proto.plain_text import plain
-from proto.recordings.episodes import write_episode
-from services.by_hand.demonstration import Command, Demonstration
-from services.by_hand.policy import BY_HAND, ShownByHand
+from services.by_hand.asked import Asked
+from services.by_hand.demonstration import Command, Demonstration, LetAct
+from services.by_hand.policy import ShownByHand
 from services.by_hand.requests import Choose, Pace, Request, Simple, Stop
 from services.dashboard.feed import Feed, jpeg, outcome_content, situation_content
-from services.playing.tutoring import Case, save_or_check_config
-from services.robot_meshes import robot_meshes
-
-LOG = logging.getLogger(__name__)
 
 PICTURE_PERIOD_S: Final = 0.15
 """Least time between two pictures while the robot moves."""
+MOVING: Final = 3.0
+"""While it moves, the robot takes at least so many times as long for it as for pictures."""
 SHOW_AFTER_S: Final = 0.08
-"""When nothing is asked for this time, the robot shows what it has come to."""
-_END_WITHIN_S: Final = 30.0
+"""When nothing is asked for this time, or for as long as it takes to render pictures, the robot
+shows what it has come to."""
+_LOOK_AGAIN_S: Final = 0.5
 
 
 class _StoppedError(Exception):
@@ -51,67 +46,68 @@ class _StoppedError(Exception):
 
 
 class Robot:
-    """Obeys requests in its own thread.
+    """Obeys requests of one person. `show` runs it; `ask` may be called by another thread.
 
     Attributes:
         feed: topics `robot` (what state it is in) and `pictures`.
-        failed: what ended the thread; None while it runs.
     """
 
-    def __init__(self, config: Config, cases: Sequence[Case], folder: Path) -> None:
-        """Prepare.
+    def __init__(self, lifecycle: Lifecycle) -> None:
+        """Show nothing yet.
 
         Args:
-            config: the configuration.
-            cases: the situations to tutor, in their order.
-            folder: where demonstrations are recorded.
+            lifecycle: says when to stop, and what is waited for.
         """
         self.feed = Feed()
-        self.failed: Exception | None = None
-        self._config = config
-        self._cases = cases
-        self._folder = folder
-        self._task: Task = make_task(config.task)
+        self._lifecycle = lifecycle
         self._pace = 1.0
         self._problem = ""
         self._number = 0
-        self._kept = Counter(_cases_in(folder))
-        self._case = next(
-            (at for at, case in enumerate(cases) if not self._kept[case.name]), len(cases) - 1
-        )
-        self._played: Episode | None = None
+        self._familiar: dict[str, FamiliarPostures] = {}
+        self._shows = False
         self._pictures_due_s = 0.0
+        self._rendering_s = 0.0
         self._wanted: tuple[int, Request] | None = None
+        self._after: tuple[int, Request] | None = None
         self._changed = threading.Condition()
         self._stop = threading.Event()
-        self._ending = False
 
-    @property
-    def kept(self) -> int:
-        """Number of demonstrations in the folder."""
-        return self._kept.total()
+    def show(
+        self, simulator: Simulator, asked: Asked, cases: Sequence[tuple[str, int]], case: int
+    ) -> Episode | Choose | None:
+        """Let the person show something; what they keep.
 
-    @contextmanager
-    def working(self) -> Iterator[None]:
-        """Work in a thread until the context ends.
+        Args:
+            simulator: plays the scene.
+            asked: what is to be shown.
+            cases: name of each case to choose from, and how many demonstrations of it are kept.
+            case: index of the case that is asked for.
+
+        Returns:
+            The episode if the person keeps it, the case if they choose another one, None if they
+            discard it or the process is to stop.
 
         Raises:
-            UserError: the folder was recorded with another task, simulator or tutor.
+            UserError: the situation cannot be played.
         """
-        save_or_check_config(self._folder, self._config)
-        thread = threading.Thread(target=self._run, name="robot", daemon=True)
-        thread.start()
+        self._simulator, self._asked = simulator, asked
+        self._cases, self._case = cases, case
+        self._played: Episode | None = None
+        self._demonstration = Demonstration(
+            simulator, asked.task, asked.situation, self._postures(asked.task), asked.policy
+        )
+        with self._changed:
+            self._shows = True
         try:
-            yield
+            return self._obey_requests()
         finally:
             with self._changed:
-                self._ending = True
-                self._changed.notify()
-            self._stop.set()
-            thread.join(_END_WITHIN_S)
+                self._shows = False
 
     def ask(self, number: int, request: Request) -> bool:
         """Ask for something; False if the robot is busy with something else.
+
+        A policy that acts is interrupted.
 
         Args:
             number: of the request; the state tells the number of the last one that is done.
@@ -124,58 +120,74 @@ class Robot:
             self._pace = request.factor
             return True
         with self._changed:
-            if self._wanted is not None:
+            if not self._shows or self._after is not None:
                 return False
-            self._stop.clear()
-            self._wanted = (number, request)
-            self._changed.notify()
-        return True
+            if self._wanted is None:
+                self._stop.clear()
+                self._wanted = number, request
+                self._changed.notify()
+                return True
+            if isinstance(self._wanted[1], LetAct):
+                self._after = number, request
+                self._stop.set()
+                return True
+            return False
 
     def stop(self) -> None:
         """Stop moving. What was shown so far stays."""
         self._stop.set()
 
-    def _run(self) -> None:
-        try:
-            simulator = make_simulator(self._config.simulator)
-            try:
-                self._work(simulator)
-            finally:
-                simulator.close()
-        except Exception as error:  # the main thread tells it and ends
-            self.failed = error
+    def tell_waiting(self) -> None:
+        """Tell what is waited for while there is nothing to show."""
+        with self._changed:
+            if not self._shows:
+                what = plain(self._lifecycle.waiting_for, 500) or "the simulator"
+                self.feed.put("robot", {"waiting": what, "done": self._number})
 
-    def _work(self, simulator: Simulator) -> None:
-        self._simulator = simulator
-        self._begin()
+    def _postures(self, task: Task) -> FamiliarPostures:
+        if task.name not in self._familiar:
+            self._familiar[task.name] = FamiliarPostures.of_tutor(task)
+        return self._familiar[task.name]
+
+    def _obey_requests(self) -> Episode | Choose | None:
         while True:
             self._tell_state(busy=False)
             # A request that follows at once, as while a key is held, need not wait for pictures.
-            if not self._is_asked(within_s=SHOW_AFTER_S):
+            if not self._is_asked(within_s=max(SHOW_AFTER_S, self._rendering_s)):
                 self._show()
                 self._is_asked()
-            if self._ending or self._wanted is None:
-                return
+            if self._wanted is None:
+                return None
             number, request = self._wanted
             self._problem = ""
             self._tell_state(busy=True)
+            end: Episode | Choose | Simple | None = None
             try:
-                self._do(request)
+                end = self._do(request)
             except UserError as error:
                 self._problem = plain(error, 500)
             self._number = number
             with self._changed:
-                self._wanted = None
+                self._wanted, self._after = self._after, None
+                if self._wanted is not None:
+                    self._stop.clear()
+            if end is not None:
+                return None if isinstance(end, Simple) else end
 
     def _is_asked(self, within_s: float | None = None) -> bool:
-        """Wait for a request, or for the end; whether there is one."""
+        """Wait for a request, at most for some time or until the process is to stop."""
+        over_s = None if within_s is None else time.monotonic() + within_s
         with self._changed:
-            return self._changed.wait_for(
-                lambda: self._wanted is not None or self._ending, within_s
-            )
+            while self._wanted is None and not self._lifecycle.stopping:
+                self._lifecycle.goes_on()
+                left_s = _LOOK_AGAIN_S if over_s is None else over_s - time.monotonic()
+                if left_s <= 0.0:
+                    break
+                self._changed.wait(left_s)
+            return self._wanted is not None
 
-    def _do(self, request: Request) -> None:
-        """Do what is asked for.
+    def _do(self, request: Request) -> Episode | Choose | Simple | None:
+        """Do what is asked for; what ends the demonstration, if it does.
 
         Raises:
             UserError: it cannot be done.
@@ -184,36 +196,51 @@ class Robot:
             case Choose(case):
                 if case >= len(self._cases):
                     raise UserError(f"there are only {len(self._cases)} cases")
-                self._case = case
-                self._begin()
-            case Simple("finish"):
-                self._play_back()
-            case Simple("keep"):
-                self._keep()
-            case Simple("discard"):
-                self._next_case()
-            case Simple("restart"):
-                self._forget_play_back()
-                self._demonstration.restart()
-            case Simple("undo"):
-                # The first undo after a demonstration was played goes back to its end.
-                if not self._forget_play_back():
-                    self._demonstration.undo()
-            case Stop() | Pace() | Simple():
+                return request
+            case Simple(what):
+                return self._do_simply(what)
+            case Stop() | Pace():
                 raise TypeError(request)
             case command:
                 self._forget_play_back()
                 self._obey(command)
+                return None
+
+    def _do_simply(self, what: str) -> Episode | Simple | None:
+        match what:
+            case "finish":
+                self._play_back()
+            case "keep":
+                if self._played is None:
+                    raise UserError(
+                        "finish the demonstration first, so that you see what will be kept"
+                    )
+                return self._played
+            case "discard":
+                return Simple(what)
+            case "restart":
+                self._forget_play_back()
+                self._demonstration.restart()
+            case "undo":
+                # The first undo after a demonstration was played goes back to its end.
+                if not self._forget_play_back():
+                    self._demonstration.undo()
+        return None
 
     def _obey(self, command: Command) -> None:
         moving = self._demonstration.obey(command)
         due_s = time.monotonic()
         for _ in moving:
-            if self._stop.is_set():
+            if self._is_stopped:
                 moving.close()
                 return
             self._tell_step()
             due_s = self._wait(due_s)
+
+    @property
+    def _is_stopped(self) -> bool:
+        self._lifecycle.goes_on()
+        return self._stop.is_set() or self._lifecycle.stopping
 
     def _wait(self, due_s: float) -> float:
         """Wait until the next control step may begin; when the one after it may at the earliest."""
@@ -224,24 +251,20 @@ class Robot:
             self._stop.wait(max(0.0, due_s - time.monotonic()))
         return due_s
 
-    def _begin(self) -> None:
-        case = self._cases[self._case]
-        self._played = None
-        self._demonstration = Demonstration(self._simulator, self._task, case.situation)
-
-    def _next_case(self) -> None:
-        self._case = (self._case + 1) % len(self._cases)
-        self._begin()
-
     def _play_back(self) -> None:
-        """Play the demonstration at the task's own pace, as it will be recorded."""
+        """Play the demonstration at the task's own pace, as it will be recorded.
+
+        Raises:
+            UserError: it is not complete, or nothing could be learned from it.
+        """
+        asked = self._asked
+        version = 0 if asked.policy is None else asked.policy.version
         actions = self._demonstration.resampled()
-        case = self._cases[self._case]
         due_s = time.monotonic()
 
         def on_step(step: LiveStep) -> None:
             nonlocal due_s
-            if self._stop.is_set():
+            if self._is_stopped:
                 raise _StoppedError
             self._tell_step(step)
             due_s = self._wait(due_s)
@@ -249,22 +272,23 @@ class Robot:
         try:
             episode = play(
                 self._simulator,
-                self._task,
-                ShownByHand(actions),
-                case.situation,
-                seed=TutoringCase(self._task.name, case.number, self._kept[case.name]).seed,
-                kind=Kind.TUTORING,
-                actor=BY_HAND,
-                config_digest=self._config.digest(),
+                asked.task,
+                ShownByHand(actions, version),
+                asked.situation,
+                seed=asked.seed,
+                kind=asked.kind,
+                actor=asked.actor,
+                config_digest=asked.config_digest,
                 on_step=on_step,
+                conditions=asked.conditions,
             )
         except _StoppedError:
             self._demonstration.restore()
             return
-        if problem := misfit(episode, self._task, self._simulator.control_period_s):
+        if problem := misfit(episode, asked.task, self._simulator.control_period_s):
             self._demonstration.restore()
             raise UserError(f"nothing could be learned from this: {problem}")
-        self._played = episode
+        self._played = replace(episode, training=asked.training)
 
     def _forget_play_back(self) -> bool:
         """Go back from a demonstration that was played to the person's own; whether one was."""
@@ -273,15 +297,6 @@ class Robot:
         self._played = None
         self._demonstration.restore()
         return True
-
-    def _keep(self) -> None:
-        if self._played is None:
-            raise UserError("finish the demonstration first, so that you see what will be kept")
-        name = self._cases[self._case].name
-        write_episode(_free_file(self._folder, name), self._played, robot=robot_meshes())
-        self._kept[name] += 1
-        LOG.info("kept a demonstration of %s: %s", name, self._played.outcome.reason)
-        self._next_case()
 
     def _tell_state(self, *, busy: bool, playing: LiveStep | None = None) -> None:
         self.feed.put("robot", self._state(busy=busy, playing=playing))
@@ -294,6 +309,7 @@ class Robot:
 
     def _show(self, playing: LiveStep | None = None) -> None:
         """Render all pictures, and tell them."""
+        begun_s = time.monotonic()
         if playing is None:
             crop = crop_of_focus(float(self._demonstration.action[FOCUS]))
         else:
@@ -311,42 +327,53 @@ class Robot:
                 "crop": round(crop.width / EYE_WIDTH, 4),
             },
         )
-        self._pictures_due_s = time.monotonic() + PICTURE_PERIOD_S
+        shown_s = time.monotonic()
+        self._rendering_s = shown_s - begun_s
+        self._pictures_due_s = shown_s + max(PICTURE_PERIOD_S, MOVING * self._rendering_s)
 
     def _state(self, *, busy: bool, playing: LiveStep | None) -> dict[str, Any]:
-        shown, now = self._demonstration, self._demonstration.action
+        shown, now, asked = self._demonstration, self._demonstration.action, self._asked
         hand = shown.hand
         return {
             "done": self._number,
             "busy": busy,
             "problem": self._problem,
-            "task": self._task.name,
-            "phases": list(self._task.phase_names),
+            "task": asked.task.name,
+            "kind": asked.kind.value,
+            "policy": plain(asked.policy_words, 200),
+            "acting": busy and self._wanted is not None and isinstance(self._wanted[1], LetAct),
+            "can_act": shown.can_act and self._played is None,
+            "corrected": asked.policy is not None and shown.corrected,
+            "phases": list(asked.task.phase_names),
             "phase": shown.phase
             if playing is None
-            else self._task.phase_names.index(playing.phase),
+            else asked.task.phase_names.index(playing.phase),
             "playing": playing is not None,
             "steps": shown.steps if playing is None else playing.step,
             "undo": shown.can_undo or self._played is not None,
             "last": shown.in_last_phase,
             "hand_mm": [round(1e3 * float(value)) for value in hand.centre_m],
             "yaw_deg": round(hand.yaw_deg, 1),
+            "things": self._things(),
             "grasp": round(float(now[GRASP]), 1),
             "focus": round(float(now[FOCUS]), 1),
             "touched": sorted(shown.touched),
             "outcome": None if self._played is None else outcome_content(self._played.outcome),
-            "cases": [[case.name, self._kept[case.name]] for case in self._cases],
+            "cases": [list(each) for each in self._cases],
             "case": self._case,
             "situation": situation_content(shown.situation),
-            "kept": self._kept.total(),
+            "kept": sum(kept for _, kept in self._cases),
         }
 
-
-def _free_file(folder: Path, case: str) -> Path:
-    files = (folder / f"{case}_{BY_HAND}{number:02d}.mcap" for number in count())
-    return next(file for file in files if not file.exists())
-
-
-def _cases_in(folder: Path) -> list[str]:
-    """The case of each demonstration in a folder."""
-    return [file.name.partition("_")[0] for file in folder.glob(f"*_{BY_HAND}*.mcap")]
+    def _things(self) -> list[list[Any]]:
+        """Name, place (mm) and turn (degrees) of each box that stands on the table."""
+        bodies = self._simulator.bodies()
+        return [
+            [
+                plain(box.name, 64),
+                *(round(1e3 * float(value)) for value in bodies[box.name].position_m),
+                round(yaw_deg(bodies[box.name]), 1),
+            ]
+            for box in self._asked.task.scene(self._asked.situation).boxes
+            if box.pose.position_m[2] > 0.0
+        ]

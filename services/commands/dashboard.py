@@ -61,6 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
     host = arguments.host or config.dashboard.host
     access = Access.of(host, allow_control=arguments.allow_control)
     certificate_for(config.hub, Holder.WATCHER)  # so that what is wrong with it is told now
+    if access.control:
+        certificate_for(config.hub, Holder.OPERATOR)
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
     with heartbeat(lifecycle):

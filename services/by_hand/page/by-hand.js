@@ -14,6 +14,7 @@ let socket = null;
 let robot = null;
 let sent = 0;
 let held = null;
+let goesOn = false; // a policy was interrupted, and acts again when the person lets go
 
 const fine = (event) => byId("fine").checked || event?.shiftKey === true;
 
@@ -45,7 +46,7 @@ const CONTROLS = [
 ];
 
 const once = (what) => () => ({ do: what });
-const ACTIONS = { next: once("next"), undo: once("undo"), restart: once("restart"), finish: once("finish"),
+const ACTIONS = { act: once("act"), next: once("next"), undo: once("undo"), restart: once("restart"), finish: once("finish"),
   keep: once("keep"), discard: once("discard") };
 const keys = new Map();
 
@@ -56,7 +57,7 @@ function tell(request) {
 }
 
 function ask(request) {
-  if (busy() || socket?.readyState !== WebSocket.OPEN) return;
+  if ((busy() && !robot?.acting) || socket?.readyState !== WebSocket.OPEN) return;
   sent += 1;
   tell({ id: sent, ...request });
   show();
@@ -64,17 +65,37 @@ function ask(request) {
 
 function stop() {
   held = null;
+  goesOn = false;
   tell({ id: 0, do: "stop" });
+}
+
+// Asks for what corrects a policy that may be acting; it goes on afterwards.
+function correct(request) {
+  goesOn ||= robot?.acting === true;
+  ask(request);
 }
 
 // Asks for what a key or button stands for, again and again until `release`.
 function hold(name, request, event) {
   held = { name, request, event: { shiftKey: event.shiftKey } };
-  ask(request(event));
+  correct(request(event));
 }
 
 function release(name) {
-  if (held?.name === name) held = null;
+  if (held?.name !== name) return;
+  held = null;
+  askNext();
+}
+
+// What is asked for when the last request is done: what is held again, or that the policy goes on.
+function askNext() {
+  if (busy()) return;
+  if (robot.problem) held = null;
+  if (held) ask(held.request(held.event));
+  else if (goesOn) {
+    goesOn = false;
+    if (robot.can_act) ask({ do: "act" });
+  }
 }
 
 function buildControls() {
@@ -85,19 +106,19 @@ function buildControls() {
       const button = make("button", { type: "button", "aria-label": `${group} ${words}` }, words, make("kbd", {}, shown));
       button.addEventListener("pointerdown", (event) => hold(button, request, event));
       for (const end of ["pointerup", "pointerleave", "pointercancel"]) button.addEventListener(end, () => release(button));
-      button.addEventListener("click", (event) => { if (event.detail === 0) ask(request(event)); }); // from the keyboard
+      button.addEventListener("click", (event) => { if (event.detail === 0) correct(request(event)); }); // from the keyboard
       field.append(button);
     }
     byId("controls").append(field);
   }
-  for (const [id, request] of Object.entries(ACTIONS)) byId(id).addEventListener("click", () => ask(request()));
+  for (const [id, request] of Object.entries(ACTIONS)) byId(id).addEventListener("click", () => { goesOn = false; ask(request()); });
   byId("stop").addEventListener("click", stop);
   byId("pace").addEventListener("change", ({ target }) => { tellPace(); target.blur(); });
   byId("case").addEventListener("change", ({ target }) => { ask({ do: "case", case: Number(target.value) }); target.blur(); });
   for (const camera of ["eye", "outside"]) {
     byId(camera).addEventListener("click", (event) => {
       const { left, top, width, height } = event.target.getBoundingClientRect();
-      ask({
+      correct({
         do: document.querySelector("input[name=click]:checked").value, camera,
         across: Math.min(Math.max((event.clientX - left) / width, 0), 1),
         down: Math.min(Math.max((event.clientY - top) / height, 0), 1),
@@ -134,7 +155,9 @@ function show() {
   const moving = busy();
   document.body.dataset.busy = String(moving);
   document.body.dataset.done = String(robot.done);
-  byId("task").textContent = `${robot.task}, tutored by hand`;
+  document.body.dataset.acting = String(robot.acting);
+  byId("task").textContent = robot.policy ? `${robot.task}: correct a policy by hand` : `${robot.task}, tutored by hand`;
+  byId("kind").textContent = robot.policy ? `${robot.kind} of ${robot.policy}` : `${robot.kind} sequence`;
   byId("situation").textContent = situationText(robot.situation);
   byId("kept").textContent = `${robot.kept} kept`;
   showCases();
@@ -144,18 +167,29 @@ function show() {
   const touched = robot.touched.length ? ` The robot has touched: ${robot.touched.join(", ")}.` : "";
   byId("state").textContent = (robot.outcome ? outcomeText(robot.outcome)
     : robot.playing ? `Playing it at the task's pace: step ${robot.steps + 1}`
-      : `${robot.steps} control steps so far.${touched}`);
+      : robot.acting ? "The policy acts. Hold a key to take over; let go, and it goes on from there."
+        : `${robot.steps} control steps so far.${correctionText()}${touched}`);
   byId("problem").textContent = robot.problem;
   const [right, forward, up] = robot.hand_mm;
   const rows = [["hand right", centimetres(right)], ["hand forward", centimetres(forward)], ["hand up", centimetres(up)],
     ["hand turned", `${robot.yaw_deg.toFixed(1)}°`], ["grasp", robot.grasp.toFixed(1)], ["focus", robot.focus.toFixed(1)]];
   byId("hand-state").replaceChildren(...rows.flatMap(([name, value]) => [make("dt", {}, name), make("dd", { id: name.replace(" ", "-") }, value)]));
+  const things = robot.things.map(([name, x, y, z, turned]) => [name, ...[x, y, z].map(centimetres), `${turned.toFixed(1)}°`]);
+  byId("things").replaceChildren(...things.map((row) => make("tr", { "data-name": row[0] }, ...row.map((text) => make("td", {}, text)))));
+  byId("act").hidden = !robot.policy;
+  byId("act").disabled = moving || !robot.can_act;
   byId("undo").disabled = moving || !robot.undo;
   byId("restart").disabled = moving || !robot.undo;
   byId("next").disabled = moving || robot.last || robot.outcome !== null;
   byId("finish").disabled = moving || !robot.last || robot.outcome !== null;
   byId("keep").disabled = moving || robot.outcome === null;
   byId("discard").disabled = moving;
+}
+
+function correctionText() {
+  if (!robot.policy) return "";
+  if (robot.corrected) return robot.can_act ? " Corrected; the policy can go on." : " Corrected.";
+  return robot.can_act ? "" : " The policy did all of it: correct it, or go to the next case.";
 }
 
 function outcomeText(outcome) {
@@ -199,18 +233,16 @@ function connect() {
       byId("problem").textContent = told.problem;
       sent = robot?.done ?? 0;
     } else {
-      sent = robot === null ? told.done : Math.max(sent, told.done);
-      robot = told;
-      showBanner();
+      sent = robot === null || told.waiting ? told.done : Math.max(sent, told.done);
+      robot = told.waiting ? null : told;
+      showBanner(told.waiting && `There is nothing to show yet. The robot waits for ${told.waiting}.`);
       show();
-      if (held && !busy()) {
-        if (robot.problem) held = null;
-        else ask(held.request(held.event));
-      }
+      if (robot) askNext();
     }
   };
   socket.onclose = ({ code, reason }) => {
     robot = held = null;
+    goesOn = false;
     if (code === 1008) { showBanner(`Not connected: ${reason}.`); return; }
     showBanner(code === 1013 ? `Not connected: ${reason}. One robot has one tutor; this page goes on when the other leaves.`
       : "The connection to the robot is lost. It stands still, and what was shown so far is kept. Trying again…");

@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import socket
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from ports import free_endpoint
 from processes import PATIENCE_S, eventually
 from run_metrics import ACTOR, EVALUATOR, LEARNER, score
 from staged_run import StagedRun, Told, dashboard
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from deploy.certificates import make_certificates
+from proto.bus import open_hub
+from proto.config import Config, HubConfig, RunConfig
 from proto.episode import Episode, Measure, Outcome
 from proto.messages import Command
 from proto.metrics import EpochMetrics
@@ -148,6 +153,56 @@ def test_a_run_is_controlled_only_where_that_is_allowed(staged: StagedRun) -> No
         browser.hear(lambda: "told" in browser.newest)
         assert browser.newest["told"]["replies"] == ["learner l: done"]
     assert staged.commands == [Command.PAUSE]
+
+
+@pytest.fixture
+def secure(tmp_path: Path) -> Iterator[StagedRun]:
+    """A run whose hub asks for certificates; a dashboard of it has that of a watcher only."""
+    made, own = tmp_path / "made", tmp_path / "own"
+    make_certificates(made)
+    own.mkdir(mode=0o700)
+    for name in ("authority.crt", "watcher.crt", "watcher.key"):
+        shutil.copy(made / name, own)
+    hub = HubConfig(
+        endpoint=free_endpoint().replace("tcp/", "tls/"), security="mutual-tls", certificates=made
+    )
+    config = Config(run=RunConfig(name="secure", folder=tmp_path), hub=hub)
+    with open_hub(hub, "secure", "hub"):
+        run = StagedRun(config)
+        try:
+            run.join(LEARNER)
+            looks = hub.model_copy(update={"certificates": own})
+            run.config = config.model_copy(update={"hub": looks})
+            yield run
+        finally:
+            run.close()
+
+
+def test_with_certificates_only_an_operator_controls_a_run(
+    secure: StagedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, own = secure.config, tmp_path / "own"
+    with dashboard(config, control=True) as address, browsing(address) as connection:
+        browser = Browser(connection)
+        browser.hear(lambda: bool(browser.newest.get("run", {}).get("connected")))
+        browser.ask({"command": "stop", "role": "learner"})
+        browser.hear(lambda: "told" in browser.newest)
+        (reply,) = browser.newest.pop("told")["replies"]
+        assert f"{own}/operator.crt does not exist" in reply
+        assert secure.commands == []
+
+        for name in ("operator.crt", "operator.key"):
+            shutil.copy(tmp_path / "made" / name, own)
+        for command in Command:
+            browser.ask({"command": command.value, "role": "learner"})
+            browser.hear(lambda: "told" in browser.newest)
+            assert browser.newest.pop("told")["replies"] == ["learner l: done"]
+        assert secure.commands == list(Command)
+
+    (own / "operator.crt").unlink()
+    where = ["--connect", config.hub.endpoint, "--set", f"hub.certificates={own}"]
+    assert main(["dashboard", "--allow-control", *where]) == 2
+    assert f"{own}/operator.crt does not exist" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("request_text", ["{", "[]", "7", '{"watch": 3}', "[" * 3000, "x" * 5000])
