@@ -12,6 +12,7 @@ import hashlib
 import math
 import shutil
 import tempfile
+import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -129,10 +130,14 @@ class IcubModel:
     seen_in_recordings: tuple[Visual, ...]
 
 
+_BUILDING: Final = threading.Lock()
+
+
 def build_icub(cache: Path) -> IcubModel:
     """Build the robot in the folder `cache`, or find it there.
 
     Many processes may build at once: each builds in a folder of its own and renames it when done.
+    Threads of a process take turns, because the library that simplifies meshes keeps global data.
 
     Raises:
         OSError: a mesh cannot be read, or the folder cannot be written.
@@ -142,8 +147,9 @@ def build_icub(cache: Path) -> IcubModel:
     source = urdf.Tree(ET.parse(official).getroot())
     inputs = [official, *mesh_files(source, meshes)]
     folder = cache / f"icub-{_digest(inputs)}"
-    if not folder.is_dir():
-        _build_into(folder, source, meshes)
+    with _BUILDING:
+        if not folder.is_dir():
+            _build_into(folder, source, meshes)
     return IcubModel(
         urdf=folder / "icub.urdf",
         colliders=COLLIDERS,

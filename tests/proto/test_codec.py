@@ -61,7 +61,7 @@ MESSAGES = st.one_of(
     st.builds(
         TrialRequest, IDS, IDS, COUNTS, WORDS, PLAYERS, st.lists(COUNTS, max_size=32).map(tuple)
     ),
-    st.builds(Trial, st.integers(0, 2**63 - 1), CONDITIONS),
+    st.builds(Trial, COUNTS, st.integers(0, 2**63 - 1), CONDITIONS),
     st.builds(Control, st.sampled_from(Command)),
     st.builds(
         PolicyVersion,

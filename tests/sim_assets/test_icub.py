@@ -1,6 +1,8 @@
 """The built robot: the official kinematics with our limits, eye, hand and colliders."""
 
-import threading
+import multiprocessing
+from collections.abc import Callable
+from multiprocessing.pool import Pool, ThreadPool
 from pathlib import Path
 
 import icub_models
@@ -145,16 +147,12 @@ def test_the_build_is_cached(built):
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
 
 
-def test_several_processes_can_build_at_once(tmp_path: Path):
-    models = []
-    threads = [
-        threading.Thread(target=lambda: models.append(build_icub(tmp_path))) for _ in range(2)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(models) == 2
+@pytest.mark.parametrize(
+    "pool", [multiprocessing.get_context("spawn").Pool, ThreadPool], ids=["processes", "threads"]
+)
+def test_several_can_build_at_once(tmp_path: Path, pool: Callable[[int], Pool]):
+    with pool(2) as builders:
+        models = builders.map(build_icub, [tmp_path] * 2)
     assert len(set(models)) == 1
     assert models[0].urdf.is_file()
     assert list(tmp_path.iterdir()) == [models[0].urdf.parent]
