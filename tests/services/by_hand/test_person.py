@@ -68,10 +68,12 @@ def browser() -> Iterator[Browser]:
 
 
 @contextmanager
-def opened(browser: Browser, address: str, *, script: str = "") -> Iterator[Page]:
+def opened(
+    browser: Browser, address: str, *, script: str = "", viewport: dict[str, int] = WIDE
+) -> Iterator[Page]:
     """Open the page; afterwards nothing may have gone wrong, and nothing have left the host."""
     troubles: list[str] = []
-    context = browser.new_context(viewport=WIDE)  # type: ignore[arg-type]
+    context = browser.new_context(viewport=viewport)  # type: ignore[arg-type]
     page = context.new_page()
     page.set_default_timeout(PATIENCE_MS)
     page.on("pageerror", lambda error: troubles.append(str(error)))
@@ -120,6 +122,13 @@ def test_what_is_wrong_is_told(browser: Browser) -> None:
                 expect(second.locator("#banner")).to_contain_text("what was shown so far is kept")
                 with idle_page(urlsplit(address).port or 0):
                     expect(second.locator("#banner")).to_contain_text("waits for something")
+
+
+def test_the_page_fits_a_phone(browser: Browser) -> None:
+    with idle_page() as address, opened(browser, address, viewport=PHONE) as page:
+        widths = page.locator(".panel").evaluate_all("all => all.map(each => each.offsetWidth)")
+        assert min(widths) > 0.9 * PHONE["width"], "each panel has the whole width"
+        assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
 
 
 class _Run:
