@@ -222,7 +222,7 @@ def test_a_person_teaches_a_run(browser: Browser, tmp_path: Path) -> None:
         expect(page.locator("#act")).to_be_disabled()
         person.press("Enter")
         expect(page.locator("#state")).to_contain_text("Played at the task's pace")
-        person.press("k")
+        page.keyboard.press("k")  # and nothing more is asked of the person
         run.eventually("policy_version", 2)
         corrections = [each for each in run.kept() if each.kind is Kind.CORRECTION]
         assert [(each.policy, each.policy_version) for each in corrections] == [("by-hand", 1)]
