@@ -50,6 +50,8 @@ _KINDS: Final[Mapping[int, Any]] = {
     Opcode.DATA_END: DataEnd,
 }
 """Kinds of records that are read; all others only index these."""
+_LAST_KIND: Final = 0x0F
+"""MCAP's own kinds of records end here; what others add is not kept when a file is damaged."""
 _START_OF_A_RECORD: Final = re.compile(rb"[\x01-\x0f].{4}\x00{4}", re.DOTALL)
 """A kind of record, and a length below 4 GiB."""
 _MOST_MESSAGES: Final = 40_000
@@ -179,6 +181,8 @@ def salvaged_records(content: bytes) -> list[McapRecord]:
     merged: list[McapRecord] = []
     while at < len(content):
         frame = _frame(content, at)
+        if frame is not None and frame.kind > _LAST_KIND:
+            frame = None
         records = None if frame is None else _salvage(content, frame, limits)
         if frame is None or records is None:
             found = _START_OF_A_RECORD.search(content, at + 1)
@@ -213,8 +217,9 @@ def _salvage(content: bytes, frame: _Frame, limits: _Limits) -> list[McapRecord]
             raise
         return None
     following = _frame(content, frame.end)
-    plausible = following is not None or content[frame.end :].startswith(MAGIC)
-    return [] if plausible else None
+    if following is None:
+        return [] if content[frame.end :].startswith(MAGIC) else None
+    return [] if following.kind <= _LAST_KIND else None
 
 
 def _is_as_written(record: McapRecord, content: bytes, frame: _Frame) -> bool:
