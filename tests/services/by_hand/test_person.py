@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from pages import PHONE, fits, needs_chromium, opened, started_browser
 from person import PATIENCE_S, Person
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, expect
 from ports import free_endpoint
 from processes import eventually, listening_hub, stop, vmdnn
 
@@ -29,9 +30,8 @@ from services.dashboard.access import Access
 from services.dashboard.ports import address_of, listening_socket
 from services.dashboard.server import serving
 
-CHROMIUM = shutil.which("chromium")
 PATIENCE_MS = 1e3 * PATIENCE_S
-WIDE, PHONE = {"width": 1280, "height": 720}, {"width": 390, "height": 844}
+opened_page = partial(opened, patience_ms=PATIENCE_MS, may_be_away=True)
 
 CASES = range(0, 40, 2)
 """Of the 45 tutored cases; corners and edges of the ranges are among them."""
@@ -51,46 +51,13 @@ SETTINGS = {
     "learner.corrections": {"rounds": 1, "choose": "random", "sequences": 1, "epochs": 2},
 }
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="there is no chromium here; apt-get install chromium"
-)
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        # Chromium refuses to run as root within its sandbox, which containers often are.
-        started = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        try:
-            yield started
-        finally:
-            started.close()
-
-
-@contextmanager
-def opened(
-    browser: Browser, address: str, *, script: str = "", viewport: dict[str, int] = WIDE
-) -> Iterator[Page]:
-    """Open the page; afterwards nothing may have gone wrong, and nothing have left the host."""
-    troubles: list[str] = []
-    context = browser.new_context(viewport=viewport)  # type: ignore[arg-type]
-    page = context.new_page()
-    page.set_default_timeout(PATIENCE_MS)
-    page.on("pageerror", lambda error: troubles.append(str(error)))
-    page.on("request", lambda asked: _check_host(asked.url, address, troubles))
-    if script:
-        page.add_init_script(script)
-    page.goto(address)
-    try:
-        yield page
-        assert troubles == []
-    finally:
-        context.close()
-
-
-def _check_host(url: str, address: str, troubles: list[str]) -> None:
-    if not url.startswith("data:") and urlsplit(url).netloc != urlsplit(address).netloc:
-        troubles.append(f"asked {url}")
+    with started_browser() as started:
+        yield started
 
 
 @contextmanager
@@ -110,11 +77,11 @@ def idle_page(port: int = 0) -> Iterator[str]:
 def test_what_is_wrong_is_told(browser: Browser) -> None:
     with ExitStack() as served:
         address = served.enter_context(idle_page())
-        with opened(browser, address, script="delete window.WebSocket") as page:
+        with opened_page(browser, address, script="delete window.WebSocket") as page:
             expect(page.locator("#banner")).to_contain_text("no WebSocket")
-        with opened(browser, address) as page:
+        with opened_page(browser, address) as page:
             expect(page.locator("#banner")).to_contain_text("waits for something to play")
-            with opened(browser, address) as second:
+            with opened_page(browser, address) as second:
                 expect(second.locator("#banner")).to_contain_text("One robot has one tutor")
                 page.goto("about:blank")
                 expect(second.locator("#banner")).to_contain_text("waits for something to play")
@@ -125,10 +92,10 @@ def test_what_is_wrong_is_told(browser: Browser) -> None:
 
 
 def test_the_page_fits_a_phone(browser: Browser) -> None:
-    with idle_page() as address, opened(browser, address, viewport=PHONE) as page:
+    with idle_page() as address, opened_page(browser, address, size=PHONE) as page:
         widths = page.locator(".panel").evaluate_all("all => all.map(each => each.offsetWidth)")
         assert min(widths) > 0.9 * PHONE["width"], "each panel has the whole width"
-        assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+        assert fits(page)
 
 
 class _Run:
@@ -185,7 +152,7 @@ def test_a_person_teaches_a_run(browser: Browser, tmp_path: Path) -> None:
         stack.enter_context(run.process("learner"))
         said = stack.enter_context(run.process("tutor", "--by-hand", "--port=0"))
         (address,) = re.findall(r"http://\S+", said)
-        page = stack.enter_context(opened(browser, address))
+        page = stack.enter_context(opened_page(browser, address))
         person = Person(page)
         person.wait()
         page.select_option("#pace", "0")

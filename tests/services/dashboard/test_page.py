@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from pages import PHONE, WIDE, fits, needs_chromium, opened, started_browser
+from playwright.sync_api import Browser, Page, expect
 from processes import eventually, stop, vmdnn
 from run_metrics import ACTOR
 from staged_run import StagedRun, Told, dashboard
@@ -23,57 +23,16 @@ from proto.periodic import every
 from proto.recordings.episodes import write_episode
 from services.playing.workers import Job, play_all
 
-CHROMIUM = shutil.which("chromium")
 PATIENCE_MS = 60_000
 JPEG = re.compile("^data:image/jpeg;base64,.{100}")
-WIDE, PHONE = {"width": 1280, "height": 720}, {"width": 390, "height": 844}
 
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None, reason="there is no chromium here; apt-get install chromium"
-)
+pytestmark = needs_chromium
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        # Chromium refuses to run as root within its sandbox, which containers often are.
-        started = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        try:
-            yield started
-        finally:
-            started.close()
-
-
-@contextmanager
-def opened(
-    browser: Browser, address: str, size: dict[str, int], scheme: str, script: str = ""
-) -> Iterator[Page]:
-    """Open the page; afterwards nothing may have gone wrong, and nothing have left the host."""
-    troubles: list[str] = []
-    context = browser.new_context(viewport=size, color_scheme=scheme)  # type: ignore[arg-type]
-    page = context.new_page()
-    page.set_default_timeout(PATIENCE_MS)
-    page.on("console", lambda said: troubles.append(said.text) if said.type == "error" else None)
-    page.on("pageerror", lambda error: troubles.append(str(error)))
-    page.on("request", lambda asked: _check_host(asked.url, address, troubles))
-    if script:
-        page.add_init_script(script)
-    page.goto(address)
-    try:
-        yield page
-        assert troubles == []
-    finally:
-        context.close()
-
-
-def _check_host(url: str, address: str, troubles: list[str]) -> None:
-    if not url.startswith("data:") and urlsplit(url).netloc != urlsplit(address).netloc:
-        troubles.append(f"asked {url}")
-
-
-def fits(page: Page) -> bool:
-    """Whether nothing is wider than the window."""
-    return bool(page.evaluate("document.documentElement.scrollWidth <= innerWidth"))
+    with started_browser() as started:
+        yield started
 
 
 def brightness(page: Page) -> float:
@@ -88,7 +47,7 @@ def test_the_page_shows_what_happens(
     told = Told(staged, episodes[1])
     with (
         dashboard(staged.config, control=True) as address,
-        opened(browser, address, WIDE, "light") as page,
+        opened(browser, address, PATIENCE_MS) as page,
         every(0.3, told.once),
     ):
         expect(page.locator("#run-name")).to_have_text("staged")
@@ -130,7 +89,7 @@ def test_the_page_fits_a_phone_and_the_night(
     hostile = "<img src=x onerror=alert(1)>"
     with (
         dashboard(staged.config) as address,
-        opened(browser, address, PHONE, "dark") as page,
+        opened(browser, address, PATIENCE_MS, size=PHONE, scheme="dark") as page,
         every(0.5, told.once),
         every(0.5, lambda: staged.tell(replace(ACTOR, waiting_for=hostile, backend=hostile))),
     ):
@@ -165,7 +124,7 @@ def test_a_lost_connection_is_told_and_made_again(browser: Browser, staged: Stag
 def test_a_browser_without_websocket_is_told(browser: Browser, staged: StagedRun) -> None:
     with (
         dashboard(staged.config) as address,
-        opened(browser, address, WIDE, "light", "delete window.WebSocket") as page,
+        opened(browser, address, PATIENCE_MS, script="delete window.WebSocket") as page,
     ):
         expect(page.locator("#banner")).to_contain_text("no WebSocket")
 
@@ -192,7 +151,7 @@ def test_the_video_of_a_failure_plays(browser: Browser, staged: StagedRun, failu
     for recording in rollouts.iterdir():
         recording.unlink()
     shutil.copy(failure, rollouts)
-    with dashboard(staged.config) as address, opened(browser, address, WIDE, "light") as page:
+    with dashboard(staged.config) as address, opened(browser, address, PATIENCE_MS) as page:
         page.select_option("#filter-outcome", "failed")
         page.locator("#rollouts tbody tr").click()
         video = page.locator("#video")
@@ -213,7 +172,7 @@ def test_replay_shows_one_recording(browser: Browser, tmp_path: Path, failure: P
     with vmdnn("replay", failure, "--open", "--set", "dashboard.port=0", log=log) as process:
         eventually(lambda: "(Ctrl-C ends)" in log.read_text(), "its address")
         (address,) = re.findall(r"http://\S+", log.read_text())
-        with opened(browser, address, WIDE, "light") as page:
+        with opened(browser, address, PATIENCE_MS) as page:
             expect(page.locator("#player-title")).to_contain_text("practice of yaw-blind")
             expect(page.locator("#live")).to_be_hidden()
             expect(page.locator("#video")).to_be_visible(timeout=4 * PATIENCE_MS)
