@@ -133,8 +133,10 @@ class Round:
             return self._missing[seed]
 
     def is_played_by(self, player: Player) -> bool:
-        """Whether a player can help with what the round waits for: corrections, or practice."""
+        """Whether a player can play what the round waits for, corrections or practice, if anything."""
         with self._lock:
+            if not self._missing and not self._searching:
+                return True
             if any(self._fits(plan, player) for plan in self._missing.values()):
                 return True
             return self._searching and any(

@@ -102,8 +102,10 @@ def test_the_search_for_failures_of_a_good_policy_ends(
     assert not round_.complete, "the one failure is still to be corrected"
     round_.judge(verdict(P + 9))
     assert [asked.seed for asked in ask_all(round_)] == [P]
+    assert not round_.is_played_by(Player("third"))
     round_.keep(correction(P))
     assert round_.complete
+    assert round_.is_played_by(Player("third")), "it waits for nobody"
 
 
 @pytest.mark.parametrize(
