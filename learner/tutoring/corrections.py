@@ -133,7 +133,7 @@ class Round:
             return self._missing[seed]
 
     def is_played_by(self, player: Player) -> bool:
-        """Whether a player can play what the round waits for, corrections or practice, if anything."""
+        """Whether a player can play what the round waits for, if it waits for anything."""
         with self._lock:
             if not self._missing and not self._searching:
                 return True
