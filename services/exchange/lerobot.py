@@ -186,8 +186,8 @@ def _write_group(
             if show is None:
                 columns[EYE] = [{"bytes": _png(image), "path": None} for image in episode.images]
             else:
-                for image in episode.images:
-                    show(np.repeat(image[..., None], 3, axis=-1))
+                for step, image in enumerate(episode.images):
+                    show(np.repeat(image[..., None], 3, axis=-1), key=step == 0)
             arrays = [_arrow_array(pa, columns[name], schema.field(name)) for name in schema.names]
             data.write_table(pa.table(arrays, schema=schema))
             _note(episode, columns, _Place(chunk, file, begin / fps), fps, videos, written)

@@ -14,6 +14,7 @@ from typing import Any, Final, Protocol
 import av
 import numpy as np
 from av.filter import Graph
+from av.video.frame import PictureType
 from numpy.typing import NDArray
 
 from proto.errors import UserError
@@ -24,6 +25,13 @@ Picture = NDArray[np.uint8]
 QUALITY: Final = 18
 """H.264's constant rate factor; below 20 a difference is hardly seen."""
 _SMALLEST_FPS: Final = 0.01
+
+
+class WritePicture(Protocol):
+    """Adds a picture to a video."""
+
+    def __call__(self, picture: Picture, *, key: bool = False) -> None:
+        """Add a picture; a key picture can be shown without those before it."""
 
 
 class _Encoder(Protocol):
@@ -56,7 +64,7 @@ def video_argument(name: str) -> Path:
 
 
 @contextmanager
-def video_file(out: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
+def video_file(out: Path, fps: float) -> Iterator[WritePicture]:
     """Open a video to write pictures (height, width, 3) uint8, RGB, to; all of the same size.
 
     The video is encoded in a temporary folder and copied to `out` when it is complete. An MP4 file
@@ -79,13 +87,15 @@ def video_file(out: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
             encoder: _Encoder | None = None
             count = 0
 
-            def write(picture: Picture) -> None:
+            def write(picture: Picture, *, key: bool = False) -> None:
                 nonlocal encoder, count
                 if encoder is None:
                     height, width = picture.shape[:2]
                     encoder = _ENCODERS[out.suffix](container, rate, width, height)
                 frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
                 frame.pts, frame.time_base = count, 1 / rate
+                if key:
+                    frame.pict_type = PictureType.I
                 count += 1
                 container.mux(list(encoder.encode(frame)))
 
@@ -100,7 +110,9 @@ class _H264:
     """H.264 with the colours of half resolution, the only ones that every browser decodes."""
 
     def __init__(self, container: Any, rate: Fraction, width: int, height: int) -> None:
-        self._stream = container.add_stream("libx264", rate=rate, options={"crf": str(QUALITY)})
+        # No picture depends on a later one (a B-frame): Rerun cannot show such videos.
+        options = {"crf": str(QUALITY), "bf": "0", "forced-idr": "1"}
+        self._stream = container.add_stream("libx264", rate=rate, options=options)
         self._stream.width, self._stream.height = width, height
         self._stream.pix_fmt = "yuv420p"
 

@@ -51,6 +51,20 @@ def test_an_mp4_file_is_what_browsers_play(tmp_path: Path) -> None:
     assert 0 < content.find(b"moov") < content.find(b"mdat")
 
 
+def test_a_video_can_be_played_from_each_key_picture(tmp_path: Path) -> None:
+    """As readers of data sets do, which begin with any episode."""
+    path = tmp_path / "video.mp4"
+    with video_file(path, 10.0) as add:
+        for number in range(40):
+            grey = np.linspace(0, 150, 128, dtype=np.uint8) + np.uint8(number)
+            add(np.broadcast_to(grey[:, None], (96, 128, 3)), key=number in (0, 13))
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+        keys = {number for number, packet in enumerate(packets) if packet.is_keyframe}
+        assert {0, 13} <= keys
+        assert [packet.pts for packet in packets] == sorted(packet.pts for packet in packets)
+
+
 def test_a_rate_that_is_no_whole_number_is_kept(tmp_path: Path) -> None:
     write(tmp_path / "video.mp4", fps=12.5)
     with av.open(str(tmp_path / "video.mp4")) as container:
