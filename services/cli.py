@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import re
 import sys
 from collections.abc import Collection, Sequence
+from difflib import get_close_matches
 from importlib.metadata import version
-from typing import Final, Protocol, cast
+from typing import Final, NoReturn, Protocol, cast
 
 from proto.errors import UserError
 from proto.plain_text import plain_lines
@@ -91,9 +93,22 @@ def whole_parser() -> argparse.ArgumentParser:
     return _parser(COMMANDS)
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser that names a similar word if a word is none of those to choose from."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the usage and what is wrong, and exit with the status 2."""
+        if found := re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)$", message):
+            word, choices = found.groups()
+            similar = get_close_matches(word, re.findall(r"[\w-]+", choices), n=1)
+            if similar:
+                message = f"{message[: found.start()]}{word!r}: did you mean {similar[0]}?"
+        super().error(message)
+
+
 def _parser(configured: Collection[str]) -> argparse.ArgumentParser:
     """Return a parser that knows all subcommands, and the arguments of those in `configured`."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="vmdnn",
         description="Tutor simulated iCub humanoids with VMDNN, from one laptop to a cluster.",
         epilog="`vmdnn COMMAND --help` explains a command.",

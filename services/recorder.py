@@ -32,6 +32,7 @@ from proto.recordings.schemas import SceneUpdate
 from services.monitoring.run_monitor import RunMonitor
 from services.recordings import Recordings
 from services.robot_meshes import robot_meshes
+from services.terminal.run_words import outcome_words
 
 LOG = logging.getLogger(__name__)
 
@@ -124,7 +125,7 @@ class Recorder:
             LOG.info(
                 "recorded %s of policy %d, seed %d: %s, %s",
                 *(episode.kind, episode.policy_version, episode.seed),
-                *(plain(episode.outcome.reason), path.name),
+                *(plain(outcome_words(episode.outcome.reason)), path.name),
             )
 
     def _write(self, path: Path, episode: Episode) -> None:

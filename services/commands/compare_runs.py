@@ -16,7 +16,7 @@ from services.terminal.console import make_console
 from services.terminal.rates import rate_text
 from services.trials.paired import PairedTrials, pair_trials
 from services.trials.run_folder import RunFolder
-from services.trials.success import READINGS
+from services.trials.success import READINGS, Tally
 from services.trials.trial_log import CountedTrial
 
 Difference = tuple[str, Any, Any]
@@ -49,15 +49,19 @@ def run(arguments: argparse.Namespace) -> int:
         run.trials(version, suite)
         for run, version, suite in zip(runs, versions, suites, strict=True)
     ]
+    tallies = [
+        run.tally(version, suite)
+        for run, version, suite in zip(runs, versions, suites, strict=True)
+    ]
     first, second = (run.config.model_dump(mode="json") for run in runs)
     differences = list(_differences(first, second))
     paired = _paired(*trials)
     if arguments.json:
-        print(json.dumps(_numbers(runs, versions, differences, paired)))
+        print(json.dumps(_numbers(runs, versions, tallies, differences, paired)))
         return 0
     console = make_console()
     console.print(_config_table(differences))
-    console.print(_success_table(runs, versions, suites, paired))
+    console.print(_success_table(runs, versions, tallies, paired))
     return 0
 
 
@@ -97,6 +101,7 @@ def _paired(first: list[CountedTrial], second: list[CountedTrial]) -> PairedTria
 def _numbers(
     runs: list[RunFolder],
     versions: list[int],
+    tallies: list[Tally],
     differences: list[Difference],
     paired: PairedTrials | None,
 ) -> dict[str, Any]:
@@ -104,10 +109,7 @@ def _numbers(
         "runs": [str(run.folder) for run in runs],
         "versions": versions,
         "config": [{"key": k, "first": one, "second": two} for k, one, two in differences],
-        "success": [
-            run.tally(version, run.config.suites[0]).as_json()
-            for run, version in zip(runs, versions, strict=True)
-        ],
+        "success": [tally.as_json() for tally in tallies],
         "paired": None if paired is None else paired.as_json(),
     }
 
@@ -122,7 +124,7 @@ def _config_table(differences: list[Difference]) -> Table:
 
 
 def _success_table(
-    runs: list[RunFolder], versions: list[int], suites: list[Suite], paired: PairedTrials | None
+    runs: list[RunFolder], versions: list[int], tallies: list[Tally], paired: PairedTrials | None
 ) -> Table:
     """Success of both, and McNemar's test if they were tried in the same situations."""
     caption = "% of the trials with the 95 % interval"
@@ -130,23 +132,24 @@ def _success_table(
         caption += "; no situation was tried in both runs, so they are not paired"
     else:
         caption += (
-            f"; alone: of {len(paired.pairs)} situations that both were tried in, those in which"
-            " only this one succeeded; p: McNemar's exact test"
+            f"; alone: in how many of {len(paired.pairs)} situations that both were tried in only"
+            " the first and only the second succeeded; p: McNemar's exact test"
         )
     named = " and ".join(
         f"{run.folder} version {version}" for run, version in zip(runs, versions, strict=True)
     )
     table = Table(title=named, caption=caption)
-    headings = ("reading", "first", "second", "first alone", "second alone", "p")
-    for heading in headings:
-        table.add_column(heading, justify="left" if heading == "reading" else "right")
-    tallies = [run.tally(v, suite) for run, v, suite in zip(runs, versions, suites, strict=True)]
+    table.add_column("reading")
+    tested_headings = ("alone", "p") if paired is not None else ()
+    for heading in ("first", "second", *tested_headings):
+        table.add_column(heading, justify="right")
     for reading in READINGS:
         rates = [rate_text(tally.rate(reading)) for tally in tallies]
-        tested: tuple[str, ...] = ("", "", "")
+        tested: tuple[str, ...] = ()
         if paired is not None:
             counts = paired.counts(reading)
-            tested = (str(counts.only_first), str(counts.only_second), f"{counts.p_value:.2g}")
+            alone = f"{counts.only_first} / {counts.only_second}"
+            tested = (alone, f"{counts.p_value:.2g}")
         table.add_row(reading, *rates, *tested)
     table.add_row("trials", *(str(tally.trials) for tally in tallies))
     return table

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from proto.config import Config
 from proto.config_keys import ConfigKey, config_keys
+from proto.errors import UserError
 from proto.strict_yaml import dump_yaml
 from services.arguments.common import add_config, config_of
 
@@ -46,6 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(markdown(), end="")
         return 0
     keys = [key for key in config_keys() if arguments.only in key.name]
+    if not keys:
+        raise UserError(f"no key contains {arguments.only!r}; `vmdnn config` lists all keys")
     if arguments.json:
         print(json.dumps([asdict(key) | {"value": _value(key, config)} for key in keys], indent=2))
         return 0

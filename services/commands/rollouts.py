@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 from itertools import chain, starmap
@@ -41,19 +42,26 @@ def run(arguments: argparse.Namespace) -> int:
     """List the rollouts in the order in which they were played."""
     folder = arguments.run_folder / "rollouts"
     folder = folder if folder.is_dir() else arguments.run_folder
+    if not folder.is_dir():
+        raise UserError(f"there is no folder {folder}; `vmdnn runs` lists the runs")
     files = sorted(folder.glob("*.mcap"))
     if not files:
         raise UserError(f"{folder} holds no recording (*.mcap)")
     console = make_console(stderr=True)
     found: list[tuple[Path, EpisodeHeading]] = []
+    outcomes: Counter[str] = Counter()
     for file in files:
         try:
             head = read_heading(file)
         except UserError as error:
             console.print(plain(f"left out: {error}"), soft_wrap=True)
             continue
+        outcomes[outcome_words(head.outcome.reason)] += 1
         if _is_wanted(head, arguments):
             found.append((file, head))
+    if not found and outcomes:
+        there_are = ", ".join(f"{words} {count}" for words, count in outcomes.most_common())
+        console.print(plain(f"no recording fits; there are: {there_are}", 500), soft_wrap=True)
     found.sort(key=lambda each: each[1].started_s or 0.0)
     if arguments.json:
         print(json.dumps([_numbers(*each) for each in found], indent=2))

@@ -122,8 +122,8 @@ class RunFolder:
             best = self.best_version(suite)
             if best is None:
                 raise UserError(
-                    f"no trial was counted in {self.folder} yet, so the best version is not known;"
-                    " choose all or newest"
+                    f"no trial of suite {suite.name} was counted in {self.folder} yet, so the best"
+                    " version is not known; name another version, such as newest"
                 )
             return [best]
         if not words.isdecimal() or int(words) not in versions:

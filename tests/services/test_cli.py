@@ -96,6 +96,34 @@ def test_a_key_that_does_not_exist_is_answered_with_a_similar_one(
     assert f"did you mean {meant}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [("rollout runs/smoke", "rollouts"), ("evalute", "evaluate"), ("inspect tsk", "task")],
+)
+def test_a_word_that_does_not_exist_is_answered_with_a_similar_one(
+    capsys: pytest.CaptureFixture[str], words: str, meant: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    assert ended.value.code == 2
+    assert f"did you mean {meant}?" in capsys.readouterr().err
+
+
+def test_without_a_similar_word_all_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["xyzzy"])
+    error = capsys.readouterr().err
+    assert all(name in error for name in COMMANDS)
+    assert "did you mean" not in error
+
+
+def test_keys_that_do_not_exist_are_not_shown_as_nothing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["config", "--only", "lerner."]) == 2
+    assert "no key contains 'lerner.'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", ["watch", "control actor pause", "actor"])
 def test_a_host_alone_is_no_endpoint(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:

@@ -102,7 +102,14 @@ def test_rollouts_are_found_by_their_outcome(
     assert "not lifted" in printed.out
     assert "object_y_m 0.25" in " ".join(printed.out.split())
     assert "broken.mcap" in printed.err
+    assert main(["rollouts", str(tmp_path / "run"), "--reason", "not_lifed"]) == 0
+    printed = capsys.readouterr()
+    assert (printed.out, "no recording fits; there are: " in printed.err) == ("", True)
+    assert "not lifted 1" in printed.err
     assert main(["rollouts", str(tmp_path)]) == 2
+    assert "holds no recording" in capsys.readouterr().err
+    assert main(["rollouts", str(tmp_path / "rum")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
 
 
 def test_two_runs_are_compared_in_configuration_and_success(
@@ -118,7 +125,27 @@ def test_two_runs_are_compared_in_configuration_and_success(
     assert compared["paired"]["strict"]["only_first"] == 6
     assert compared["paired"]["strict"]["mcnemar_p"] == pytest.approx(2 * 0.5**6)
     assert main(["compare-runs", str(first), str(second)]) == 0
-    assert "network.pfc.tau" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "network.pfc.tau" in printed
+    assert "6 / 0" in printed
+    assert max(map(len, printed.splitlines())) <= 80
+    assert printed.count("100.0 (61.0 to 100.0)") == 3, "not broken into two lines"
+
+
+def test_runs_are_compared_in_the_suite_that_was_chosen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = make_run(tmp_path / "a", {1: [PRECISE] * 3})
+    second = make_run(tmp_path / "b", {1: [PRECISE] * 3})
+    words = ("compare-runs", first, second, "--policy-version", "newest", "--suite", "beyond")
+    compared = as_json(capsys, *words)
+    assert isinstance(compared, dict)
+    assert [each["trials"] for each in compared["success"]] == [0, 0]
+    assert compared["paired"] is None
+    assert main([*map(str, words)]) == 0
+    assert "alone" not in capsys.readouterr().out
+    assert main(["compare-runs", str(first), str(second), "--suite", "beyond"]) == 2
+    assert "no trial of suite beyond was counted" in capsys.readouterr().err
 
 
 @pytest.fixture
