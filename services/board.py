@@ -17,6 +17,8 @@ from proto.keys import Role
 from proto.messages import Live, Pictures
 from proto.metrics import (
     METRICS,
+    MOST_EPOCHS,
+    EpochMetrics,
     EvaluatorMetrics,
     LearnerMetrics,
     Metrics,
@@ -130,6 +132,25 @@ class _Losses:
             self._every *= 2
 
 
+class _Epochs:
+    """The epochs of a training that a learner told and nobody has taken, at most the newest."""
+
+    def __init__(self) -> None:
+        self._training = ""
+        self._waiting: deque[EpochMetrics] = deque(maxlen=MOST_EPOCHS)
+
+    def add(self, metrics: LearnerMetrics) -> None:
+        if metrics.training != self._training:
+            self._training = metrics.training
+            self._waiting.clear()
+        self._waiting.extend(metrics.epochs)
+
+    def taken(self) -> tuple[EpochMetrics, ...]:
+        taken = tuple(self._waiting)
+        self._waiting.clear()
+        return taken
+
+
 class Board:
     """Collects the metrics and the presence of all processes of the bus's run."""
 
@@ -148,6 +169,7 @@ class Board:
         self._vanished_at_s: dict[ProcessKey, float] = {}  # by the clock
         self._heard_s: dict[ProcessKey, float] = {}
         self._losses = _Losses()
+        self._epochs = _Epochs()
         for role in Role:
             bus.watch_presence(role, self._presence_of(role))
         bus.subscribe(bus.keys.metrics(), self._keep, *METRICS)
@@ -172,6 +194,11 @@ class Board:
         with self._changed:
             return list(self._losses.kept)
 
+    def take_epochs(self) -> tuple[EpochMetrics, ...]:
+        """The epochs that the learner has told since the last call, at most MOST_EPOCHS."""
+        with self._changed:
+            return self._epochs.taken()
+
     def wait_for_all(self, timeout_s: float) -> RunView:
         """Wait until every living process has published metrics, or the time is up.
 
@@ -194,6 +221,7 @@ class Board:
             self._heard_s[process] = time.time()
             if isinstance(metrics, LearnerMetrics) and process in self._present:
                 self._losses.add(metrics)
+                self._epochs.add(metrics)
             self._changed.notify_all()
 
     def _forget(self) -> None:

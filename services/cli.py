@@ -94,7 +94,16 @@ def whole_parser() -> argparse.ArgumentParser:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that names a similar word if a word is none of those to choose from."""
+    """A parser that names a similar word, and tells the usage of the subcommand that was meant."""
+
+    def parse_known_args(  # type: ignore[override]  # argparse has overloads for the namespace
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse; refuse here what is not known, not in the parser of the whole command."""
+        parsed, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return parsed, unknown
 
     def error(self, message: str) -> NoReturn:
         """Print the usage and what is wrong, and exit with the status 2."""

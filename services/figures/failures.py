@@ -49,6 +49,9 @@ SHOWN: Final = 2.5
 _MARKS: Final = ((GREEN, "o"), (ORANGE, "o"), (BLUE, "^"), (BLACK, "x"), (RED, "s"), (PINK, "D"))
 """Colour and marker of each of the task's reasons in their order; repeated if there are more."""
 _READING_MARKS: Final[Mapping[str, str]] = {"strict": "o", "precise": "D"}
+MOST_CHOICES: Final = 12
+"""A discrete variable with more choices, such as one of hundreds of clips, is not drawn."""
+_MAPS_IN_A_ROW: Final = 3
 _Z95: Final = 1.96
 _EXPLANATION: Final = (
     "Dotted: tutored values. Errors are shown for trials in which the object had not moved before"
@@ -89,6 +92,11 @@ class Axis:
         """Whether the variable is discrete, so that there are no values between two others."""
         return isinstance(self.variable, Discrete)
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether the figure and the table show the variable."""
+        return not isinstance(self.variable, Discrete) or len(self.variable.choices) <= MOST_CHOICES
+
 
 @dataclass(frozen=True)
 class Trials:
@@ -120,12 +128,20 @@ class Trials:
         for trial in trials:
             task.check(trial.situation)
         axes = {each.name: Axis.of(each, trials, task) for each in task.variables}
+        axes = {name: axis for name, axis in axes.items() if len(axis.tutored) > 1}
+        if not any(axis.is_shown for axis in axes.values()):
+            raise UserError(f"task {task.name} has no variable along which failures can be drawn")
         return cls(
-            axes={name: axis for name, axis in axes.items() if len(axis.tutored) > 1},
+            axes=axes,
             situations=[trial.situation for trial in trials],
             outcomes=[trial.outcome for trial in trials],
             words=task.figure_words,
         )
+
+    @property
+    def shown(self) -> list[Axis]:
+        """The axes that the figure and the table show."""
+        return [axis for axis in self.axes.values() if axis.is_shown]
 
     def succeeded(self, reading: str) -> NDArray[np.bool_]:
         """Return (N,) whether each trial succeeded in a reading."""
@@ -259,7 +275,8 @@ def table(trials: Trials) -> Table:
     headings = (f"{reading} {place} %" for reading in READINGS for place in ("near", "between"))
     for heading in ("value", *headings, "snapping"):
         result.add_column(heading, justify="left" if heading == "value" else "right")
-    for name, axis in trials.axes.items():
+    for axis in trials.shown:
+        name = axis.variable.name
         if axis.discrete:
             _add_choices(result, trials, axis)
             continue
@@ -278,6 +295,8 @@ def table(trials: Trials) -> Table:
 def _add_choices(result: Table, trials: Trials, axis: Axis) -> None:
     """Add a row with the success for each choice of a discrete variable."""
     for each in _bins(axis):
+        if not each.chosen.any():
+            continue
         strict, precise = (
             rate_text(trials.rate(reading, each.chosen), digits=0) for reading in READINGS
         )
@@ -287,11 +306,14 @@ def _add_choices(result: Table, trials: Trials, axis: Axis) -> None:
 def draw(trials: Trials, title: str) -> Figure:
     """Draw maps of the outcomes, success by value of each variable, and errors of the grasp."""
     with figure_style():
-        axes_shown, errors = list(trials.axes.values()), trials.words.errors
-        figure = Figure(figsize=(9.0, 12.0), layout="constrained")
+        axes_shown, errors = trials.shown, trials.words.errors
+        maps = _maps(axes_shown)
+        map_rows = -(-len(maps) // _MAPS_IN_A_ROW)
+        size = (max(9.0, 1.75 * len(axes_shown)), 9.6 + 2.4 * map_rows)
+        figure = Figure(figsize=size, layout="constrained")
         figure.suptitle(title, fontsize=10)
-        rows: Any = figure.subfigures(2, 1, height_ratios=[1.15, 4.6])
-        _draw_maps(rows[0], trials)
+        rows: Any = figure.subfigures(2, 1, height_ratios=[1.15 * map_rows, 4.6])
+        _draw_maps(rows[0], trials, maps, map_rows)
         axes = rows[1].subplots(
             1 + len(errors), len(axes_shown), sharex="col", sharey="row", squeeze=False
         )
@@ -319,11 +341,20 @@ def _marks(trials: Trials) -> Iterator[tuple[str, str, str, str]]:
         yield reason, words, colour, marker
 
 
-def _draw_maps(figure: Any, trials: Trials) -> None:
-    shown = list(trials.axes.values())
-    pairs = list(combinations(shown, 2)) or [(shown[0],) * 2]
-    axes = figure.subplots(1, len(pairs), squeeze=False)[0]
-    for each, (across, up) in zip(axes, pairs, strict=True):
+def _maps(shown: Sequence[Axis]) -> list[tuple[Axis, Axis]]:
+    """The axes of each map: pairs of continuous variables, if there are two, or of all."""
+    continuous = [axis for axis in shown if not axis.discrete]
+    pairs = combinations(continuous if len(continuous) > 1 else shown, 2)
+    return list(pairs) or [(shown[0], shown[0])]
+
+
+def _draw_maps(
+    figure: Any, trials: Trials, maps: Sequence[tuple[Axis, Axis]], map_rows: int
+) -> None:
+    axes = figure.subplots(map_rows, min(len(maps), _MAPS_IN_A_ROW), squeeze=False).ravel()
+    for each in axes[len(maps) :]:
+        each.remove()
+    for each, (across, up) in zip(axes, maps, strict=False):
         for reason, words, colour, marker in _marks(trials):
             chosen = trials.ended_with(reason)
             precise = reason == NO_FAILURE
@@ -353,7 +384,7 @@ def _label_axis(side: Any, set_label: Callable[[str], object], axis: Axis) -> No
 
 
 def _draw_rates(axes: Axes, trials: Trials, axis: Axis) -> None:
-    bins = _bins(axis)
+    bins = [each for each in _bins(axis) if each.chosen.any()]
     centres = np.array([(each.low + each.high) / 2 for each in bins])
     offset = 0.06 * float(np.diff(axis.tutored).min())
     for side, reading in enumerate(READINGS):
@@ -378,9 +409,10 @@ def _lowest(trials: Trials) -> float:
     """The lowest end of an interval of success (percent)."""
     return 100 * min(
         trials.rate(reading, each.chosen).wilson95[0]
-        for axis in trials.axes.values()
+        for axis in trials.shown
         for reading in READINGS
         for each in _bins(axis)
+        if each.chosen.any()
     )
 
 

@@ -27,6 +27,8 @@ _COLOURS: Final[Mapping[str, str]] = {
     Kind.PRACTICE: YELLOW,
     Kind.CORRECTION: PINK,
 }
+_LABEL_SHARE: Final = 0.012
+"""Width of a digit of a policy version, as a share of the figure's."""
 _LONGEST_GAP_S: Final = 10.0
 """Without a sample for longer, it is not known what the learner did."""
 
@@ -81,7 +83,8 @@ class Timeline:
     @classmethod
     def of(cls, run: str, samples: Sequence[Sample], episodes: Iterable[PlayedEpisode]) -> Timeline:
         """Make the timeline of a run from its history and its recordings."""
-        spans = [*_learner_spans(samples), *_actor_spans(episodes)]
+        last_s = samples[-1].time_s if samples else float("inf")
+        spans = [*_learner_spans(samples), *_actor_spans(episodes, last_s)]
         policies: dict[int, float] = {}
         for sample in samples:
             if sample.learner is not None and sample.learner.policy_version:
@@ -96,7 +99,7 @@ class Timeline:
     @property
     def end_s(self) -> float:
         """When the last process did something, Unix time (s)."""
-        return max(span.end_s for span in self.spans)
+        return max(*(span.end_s for span in self.spans), *self.policies.values(), self.start_s)
 
     @property
     def processes(self) -> list[str]:
@@ -156,14 +159,19 @@ def draw(timeline: Timeline) -> Figure:
     """Draw a row for each process, and a line for each policy version."""
     processes = timeline.processes
     with figure_style():
-        figure = Figure(figsize=(7.2, 0.8 + 0.35 * len(processes)), layout="constrained")
+        figure = Figure(figsize=(7.2, 0.8 + 0.35 * max(2, len(processes))), layout="constrained")
         axes = figure.subplots()
         for row, process in enumerate(processes):
             spans = [span for span in timeline.spans if span.process == process]
             _draw_row(axes, row, spans, timeline.start_s)
+        minutes = (timeline.end_s - timeline.start_s) / 60
+        free_from = 0.0
         for version, seen_s in timeline.policies.items():
             minute = (seen_s - timeline.start_s) / 60
             axes.axvline(minute, color="black", linewidth=0.4, linestyle=":")
+            if minute < free_from:  # its number would cover the one before
+                continue
+            free_from = minute + _LABEL_SHARE * len(str(version)) * minutes
             axes.annotate(
                 str(version),
                 (minute, 1.0),
@@ -174,7 +182,7 @@ def draw(timeline: Timeline) -> Figure:
             )
         axes.set_yticks(range(len(processes)), processes)
         axes.invert_yaxis()
-        axes.set_xlim(0, (timeline.end_s - timeline.start_s) / 60)
+        axes.set_xlim(0, minutes)
         axes.set_xlabel("time (min); dotted: a policy version is published")
         figure.legend(
             handles=[Patch(color=_COLOURS[what], label=what) for what in timeline.things],
@@ -210,10 +218,11 @@ def _learner_spans(samples: Sequence[Sample]) -> Iterator[Span]:
         yield Span(LEARNER, told[-1][1], begun_s, told[-1][0])
 
 
-def _actor_spans(episodes: Iterable[PlayedEpisode]) -> Iterator[Span]:
+def _actor_spans(episodes: Iterable[PlayedEpisode], last_s: float) -> Iterator[Span]:
     """Yield when each episode was played.
 
-    An episode ends when it is recorded, at the latest when its actor begins the next one.
+    An episode ends when it is recorded, at the latest when its actor begins the next one or when
+    the history ends (`last_s`): a recording that was copied seems to be younger than it is.
     """
     by_actor: dict[str, list[PlayedEpisode]] = {}
     for episode in episodes:
@@ -222,5 +231,5 @@ def _actor_spans(episodes: Iterable[PlayedEpisode]) -> Iterator[Span]:
         played.sort(key=lambda episode: episode.started_s)
         next_starts = [*(episode.started_s for episode in played[1:]), float("inf")]
         for episode, next_s in zip(played, next_starts, strict=True):
-            end_s = max(min(episode.recorded_s, next_s), episode.started_s)
+            end_s = max(min(episode.recorded_s, next_s, last_s), episode.started_s)
             yield Span(actor, episode.kind, episode.started_s, end_s)

@@ -146,14 +146,16 @@ def table(history: TrainingHistory) -> Table:
     """Return a table of the success of each policy version, with the losses below it."""
     losses = [_loss_words(name, curve) for name, curve in history.stages.items()]
     result = Table(title=f"run {history.run}", caption="\n".join(losses))
-    result.add_column("suite")
+    several = len(history.scores) > 1
+    if several:
+        result.add_column("suite")
     for heading in ("policy", "trials", *READINGS):
         result.add_column(heading, justify="right")
     for suite, scores in history.scores.items():
         for version, score in sorted(scores.items()):
             rates = (Rate(getattr(score, reading), score.trials) for reading in READINGS)
             result.add_row(
-                suite,
+                *((suite,) if several else ()),
                 str(version),
                 str(score.trials),
                 *(rate_text(rate, digits=0) for rate in rates),

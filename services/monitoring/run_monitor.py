@@ -80,7 +80,8 @@ class RunMonitor:
     def _work(self) -> None:
         now_s = time.time()
         if self._files.history.is_due(now_s):
-            sample = self._sampler.sample(self._board.view(), now_s)
+            view, epochs = self._board.view(), self._board.take_epochs()
+            sample = self._sampler.sample(view, now_s, epochs)
             if sample.says_something:
                 self._files.history.add(sample)
                 self._files.curves.add(sample, self._wanted)

@@ -23,6 +23,7 @@ from proto.codec import (
 from proto.metrics import (
     ActorMetrics,
     Count,
+    EpochMetrics,
     Epochs,
     LearnerMetrics,
     Rate,
@@ -40,7 +41,7 @@ MOST_SCORES: Final = 100
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerSample:
-    """What the learner said; see `proto.metrics.LearnerMetrics`."""
+    """What the learner said since the sample before; see `proto.metrics.LearnerMetrics`."""
 
     training: Training
     stage: Stage
@@ -140,15 +141,16 @@ class Sampler:
         self._training = ""
         self._told: dict[tuple[str, int], ScoreSample] = {}
 
-    def sample(self, view: RunView, time_s: float) -> Sample:
+    def sample(self, view: RunView, time_s: float, epochs: tuple[EpochMetrics, ...] = ()) -> Sample:
         """Take a sample.
 
         Args:
             view: what is known at this moment.
             time_s: this moment, Unix time (s).
+            epochs: the epochs that the learner has told since the sample before.
         """
         learners = view.living(LearnerMetrics)
-        learner = _learner_sample(learners[0]) if learners else None
+        learner = _learner_sample(learners[0], epochs) if learners else None
         if learner is not None and learner.training != self._training:
             self._training = learner.training
             self._told = {}  # another training counts its versions from 1 again
@@ -182,12 +184,12 @@ class Sampler:
         return tuple(changed)
 
 
-def _learner_sample(learner: LearnerMetrics) -> LearnerSample:
+def _learner_sample(learner: LearnerMetrics, epochs: tuple[EpochMetrics, ...]) -> LearnerSample:
     return LearnerSample(
         training=learner.training,
         stage=learner.stage,
         round=learner.round,
-        epochs=learner.epochs,
+        epochs=epochs,
         epochs_per_s=learner.epochs_per_s,
         sequences=learner.sequences,
         policy_version=learner.policy_version,

@@ -18,7 +18,14 @@ from proto.config import HubConfig
 from proto.episode import Kind
 from proto.keys import Role
 from proto.messages import EYE_SIZE, OUTSIDE_SIZE, Live, Pictures
-from proto.metrics import ActorMetrics, Metrics, Stage
+from proto.metrics import (
+    MOST_EPOCHS,
+    ActorMetrics,
+    EpochMetrics,
+    LearnerMetrics,
+    Metrics,
+    Stage,
+)
 from proto.periodic import every
 from services.board import FORGET_AFTER_S, LOSSES_KEPT, ActorView, Board, LiveBoard
 from services.cli import main
@@ -59,6 +66,37 @@ def test_the_newest_metrics_are_kept_and_dead_processes_vanish(hub: HubConfig) -
         assert board.view().living(ActorMetrics) == []
         with join_as(hub, ACTOR):
             eventually(lambda: process not in board.view().vanished_s, "the actor is present again")
+
+
+def test_every_epoch_is_told_once_however_often_one_looks(hub: HubConfig) -> None:
+    def told(*epochs: int, training: str = "t-1") -> LearnerMetrics:
+        done = (
+            EpochMetrics(stage=Stage.COUPLED, epoch=epoch, loss=0.5, learning_rate=0.003)
+            for epoch in epochs
+        )
+        return replace(LEARNER, training=training, epochs=tuple(done), epoch=epochs[-1])
+
+    def taken(last: int) -> list[int]:
+        """Epochs that are taken once the board knows the last of them."""
+        eventually(
+            lambda: [m.epoch for m in board.view().living(LearnerMetrics)] == [last],
+            f"epoch {last} is known",
+        )
+        return [each.epoch for each in board.take_epochs()]
+
+    with open_bus(hub, RUN, Role.WATCH, "w") as bus, join_as(hub, LEARNER) as learner:
+        board = Board(bus)
+        eventually(lambda: board.view().metrics or publish(learner, LEARNER), "it is present")
+        for metrics in (told(1, 2), told(3), told(4, 5)):
+            publish(learner, metrics)
+        assert taken(5) == [1, 2, 3, 4, 5]
+        assert board.take_epochs() == ()
+        publish(learner, told(*range(6, 6 + MOST_EPOCHS)))
+        publish(learner, told(70))
+        assert taken(70) == list(range(7, 71)), "the newest ones"
+        publish(learner, told(71))
+        publish(learner, told(1, training="t-2"))
+        assert taken(1) == [1], "those of another training are forgotten"
 
 
 def test_an_actor_that_is_gone_for_good_is_forgotten(hub: HubConfig) -> None:

@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Final
 
 from actors.tasks.registry import make_task
+from proto.config import Config
 from proto.errors import UserError
 from proto.recordings.episodes import read_episode
 from services.arguments.common import add_config, config_of, integer
 from services.figures import failures
 from services.figures.figure_result import FigureResult
+from services.trials.run_folder import RunFolder
 from services.trials.trial_log import CountedTrial, read_trials
 
 NEWEST: Final = "newest"
@@ -21,6 +23,13 @@ SUMMARY: Final = "situations in which a policy fails, and its errors at the gras
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the figure's arguments."""
+    parser.add_argument(
+        "run_folder",
+        type=Path,
+        nargs="?",
+        metavar="RUN",
+        help="folder of a run: its configuration, and its counted trials in its first suite",
+    )
     add_config(parser)
     parser.add_argument(
         "--outcomes",
@@ -28,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="FILE",
-        help="file of `vmdnn evaluate --outcomes`, or evaluation/trials.jsonl of a run",
+        help="file of `vmdnn evaluate --outcomes`",
     )
     parser.add_argument(
         "--rollouts", type=Path, nargs="+", default=[], metavar="DIR", help="folders of rollouts"
@@ -40,13 +49,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def draw(arguments: argparse.Namespace) -> FigureResult:
     """Read the trials of one policy and draw the situations in which it failed."""
-    counted = list(_counted_trials(arguments))
+    config, counted = _counted(arguments)
     version = arguments.policy_version
     if version == NEWEST:
         version = max((trial.policy_version for trial in counted), default=0)
     found = [trial for trial in counted if trial.policy_version == version]
-    trials = failures.Trials.of(found, make_task(config_of(arguments).task))
+    trials = failures.Trials.of(found, make_task(config.task))
     name, version = _only_policy(found)
+    if arguments.run_folder is not None:
+        name = config.run.name
     words = f"{name} version {version}" if version else name
     return FigureResult(
         failures.draw(trials, f"{words}: {len(found)} trials"),
@@ -55,9 +66,23 @@ def draw(arguments: argparse.Namespace) -> FigureResult:
     )
 
 
+def _counted(arguments: argparse.Namespace) -> tuple[Config, list[CountedTrial]]:
+    """The configuration, and the trials of all policy versions."""
+    if arguments.run_folder is None:
+        return config_of(arguments), list(_counted_trials(arguments))
+    if arguments.outcomes or arguments.rollouts or arguments.config is not None:
+        raise UserError("name either the folder of a run, or --config, --outcomes and --rollouts")
+    run = RunFolder.open(arguments.run_folder, arguments.overrides)
+    suite = run.config.suites[0]
+    return run.config, [trial for each in run.versions for trial in run.trials(each, suite)]
+
+
 def _counted_trials(arguments: argparse.Namespace) -> Iterator[CountedTrial]:
     if not arguments.outcomes and not arguments.rollouts:
-        raise UserError("name files of outcomes with --outcomes, or folders with --rollouts")
+        raise UserError(
+            "name the folder of a run, files of outcomes with --outcomes, or folders with"
+            " --rollouts"
+        )
     for path in arguments.outcomes:
         yield from read_trials(path)
     for folder in arguments.rollouts:

@@ -13,11 +13,11 @@ from outcomes import measures
 
 from actors.tasks.experiment1.world import GRID
 from actors.tasks.registry import make_task
-from proto.config import TaskConfig
-from proto.episode import NO_FAILURE, Outcome
+from proto.config import TaskConfig, load_config
+from proto.episode import NO_FAILURE, UNKNOWN_OUTCOME, Outcome
 from proto.errors import UserError
 from services.cli import main
-from services.figures.failures import Trials, numbers, snapping
+from services.figures.failures import Trials, draw, numbers, snapping, table
 from services.trials.trial_log import CountedTrial
 
 YAW, POSITION = "object_yaw_deg", "object_y_m"
@@ -121,6 +121,64 @@ def test_the_newest_of_several_versions_is_drawn_unless_another_is_named(
     path = write(tmp_path / "trials.jsonl", [*trials, *other])
     assert main(command.split()) == 2
     assert "other version 2, run version 2" in capsys.readouterr().err
+
+
+def make_run(folder: Path, trials: Sequence[CountedTrial], *settings: str) -> Path:
+    """The folder of a run whose training is called `run`, with policies for its trials."""
+    load_config(None, [f"run.name={folder.name}", *settings]).save(folder / "config.yaml")
+    (folder / "policies").mkdir()
+    for version in {trial.policy_version for trial in trials}:
+        (folder / "policies" / f"{version:06d}.safetensors").touch()
+    (folder / "checkpoints").mkdir()
+    (folder / "checkpoints" / "run_id").write_text("run")
+    (folder / "evaluation").mkdir()
+    write(folder / "evaluation" / "trials.jsonl", trials)
+    return folder
+
+
+def test_the_trials_of_a_run_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    old = [replace(trial, run_id="earlier-training") for trial in play(nearest, 5, version=3)]
+    trials = [replace(t, seed=1000 + t.seed) for t in [*play(nearest, 9), *old]]
+    run, out = make_run(tmp_path / "tried", trials), tmp_path / "failures.png"
+    assert main(["figure", "failures", str(run), "--out", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["policy"], told["policy_version"], told["trials"]) == ("tried", 1, 9)
+    words = ["figure", "failures", str(run), "--out", str(out), "--outcomes", "x.jsonl"]
+    assert main(words) == 2
+    assert "name either the folder of a run" in capsys.readouterr().err
+    assert main(["figure", "failures", str(tmp_path), "--out", str(out)]) == 2
+    assert "is not the folder of a run" in capsys.readouterr().err
+
+
+def test_a_variable_with_hundreds_of_choices_is_not_drawn() -> None:
+    task = make_task(TaskConfig(name="experiment2"))
+    trials = Trials.of(
+        [
+            CountedTrial("run", 1, seed, f"e{seed}", "local", task.sample(seed), UNKNOWN_OUTCOME)
+            for seed in range(30)
+        ],
+        task,
+    )
+    assert len(trials.axes["take"].variable.choices) > 100  # type: ignore[union-attr]
+    figure = draw(trials, "Experiment II")
+    maps, rest = figure.subfigs
+    labels = [(axes.get_xlabel(), axes.get_ylabel()) for axes in maps.axes]
+    assert len(set(labels)) == 6, "each pair of the four continuous variables"
+    assert not any("kind" in word or "take" in word for pair in labels for word in pair)
+    assert {axes.get_xlabel() for axes in rest.axes} >= {"indicated kind", "other Y (m)"}
+    assert not any(axes.get_xlabel() == "take" for axes in rest.axes)
+    first_column = list(table(trials).columns[0].cells)
+    assert "indicated kind laying" in first_column
+    assert not any(str(cell).startswith("take") for cell in first_column)
+
+
+def test_a_range_without_trials_is_not_drawn_as_a_failure() -> None:
+    trials = [t for t in play(lambda _, value: value, 60) if float(t.situation[YAW]) < 20]
+    figure = draw(Trials.of(trials, TASK), "left half")
+    rates = figure.subfigs[1].axes[2]
+    assert rates.lines, "success by yaw"
+    drawn = np.concatenate([np.asarray(line.get_ydata(), float) for line in rates.lines[:2]])
+    assert drawn.min() == 100
 
 
 def test_files_without_trials_are_refused(

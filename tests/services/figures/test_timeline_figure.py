@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import warnings
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ from proto.episode import Episode, Kind
 from proto.metrics import Stage
 from proto.recordings.episodes import write_episode
 from services.cli import main
-from services.figures.timeline import PlayedEpisode, Timeline
+from services.figures.timeline import PlayedEpisode, Timeline, draw
 from services.monitoring.history import history_file
 from services.monitoring.sample import LearnerSample, Sample
 
@@ -72,6 +74,28 @@ def test_an_episode_ends_when_it_is_recorded_or_the_next_one_begins() -> None:
     assert timeline.processes == ["a", "b"]
     assert timeline.seconds("a") == {Kind.TUTORING: 3.0, Kind.TRIAL: 3.0, "nothing": 14.0}
     assert timeline.seconds("b") == {Kind.PRACTICE: 16.0, "nothing": 4.0}
+
+
+def test_a_recording_that_was_copied_does_not_lengthen_the_run() -> None:
+    copied = [
+        PlayedEpisode("a", Kind.TUTORING, 3.0, 9e9),
+        PlayedEpisode("a", Kind.TRIAL, 18.0, 9e9),
+    ]
+    timeline = Timeline.of("run", samples(), copied)
+    assert timeline.end_s == 20.0, "when the history ends"
+    assert timeline.seconds("a") == {Kind.TUTORING: 15.0, Kind.TRIAL: 2.0, "nothing": 3.0}
+
+
+def test_numbers_of_policies_do_not_cover_each_other() -> None:
+    close = [sample(100.0 + number, Stage.COUPLED, number + 1) for number in range(12)]
+    timeline = Timeline.of("run", [*samples(), *close, sample(400.0, Stage.COUPLED, 13)], [])
+    figure = draw(timeline)
+    with warnings.catch_warnings(action="error"):  # as when something does not fit
+        figure.draw_without_rendering()
+    (axes,) = figure.axes
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert {text.get_text() for text in axes.texts} >= {"1", "13"}
+    assert all(one.x1 <= other.x0 for one, other in pairwise(boxes))
 
 
 def test_the_command_reads_a_run(

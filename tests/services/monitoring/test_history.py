@@ -114,7 +114,10 @@ def evaluator(*strict: int) -> EvaluatorMetrics:
 
 def test_a_sample_holds_the_scores_that_changed() -> None:
     sampler = Sampler()
-    first = sampler.sample(view_of(LEARNER, evaluator(3)), 100.0)
+    epochs = (EpochMetrics(stage=Stage.COUPLED, epoch=3, loss=0.5, learning_rate=0.003),)
+    first = sampler.sample(view_of(LEARNER, evaluator(3)), 100.0, epochs)
+    assert first.learner is not None
+    assert first.learner.epochs == epochs
     assert [(s.version, s.strict, s.trials) for s in first.scores] == [(1, 3, 10)]
     assert sampler.sample(view_of(LEARNER, evaluator(3)), 101.0).scores == ()
     changed = sampler.sample(view_of(LEARNER, evaluator(4, 5)), 102.0).scores
