@@ -69,6 +69,11 @@ def add_process(parser: argparse.ArgumentParser) -> None:
     """Add --config, --set, --connect, --id and options of the log, for a process on the bus."""
     add_connection(parser)
     parser.add_argument("--id", type=_id, help="name of this process on the bus")
+    add_log_options(parser)
+
+
+def add_log_options(parser: argparse.ArgumentParser) -> None:
+    """Add options of the log, see `services.arguments.logs.ProcessLog`."""
     amount = parser.add_mutually_exclusive_group()
     amount.add_argument("-v", "--verbose", action="store_true", help="log details, too")
     amount.add_argument("-q", "--quiet", action="store_true", help="log warnings and errors only")

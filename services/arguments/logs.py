@@ -7,7 +7,6 @@ import json
 import logging
 from datetime import UTC, datetime
 
-from proto.keys import Role
 from proto.plain_text import plain_lines
 
 
@@ -15,26 +14,26 @@ class ProcessLog:
     """Writes the log of a process to standard error.
 
     Attributes:
-        role: role of the process.
+        name: what writes it: a role in a run, or a command.
         run: name of the run; empty until it is known.
         id: id of the process; empty until it is known.
     """
 
-    def __init__(self, role: Role, arguments: argparse.Namespace) -> None:
+    def __init__(self, name: str, arguments: argparse.Namespace) -> None:
         """Start to log.
 
         Args:
-            role: role of the process.
-            arguments: the parsed arguments of `services.arguments.common.add_process`.
+            name: what writes the log: a role in a run, or a command.
+            arguments: the parsed arguments of `services.arguments.common.add_log_options`.
         """
-        self.role = role
+        self.name = name
         self.run = ""
         self.id = ""
         handler = logging.StreamHandler()
         if arguments.log_format == "json":
             handler.setFormatter(_JsonFormatter(self))
         else:
-            handler.setFormatter(_plain_formatter(role))
+            handler.setFormatter(_plain_formatter(name))
         level = logging.INFO
         if arguments.quiet:
             level = logging.WARNING
@@ -45,7 +44,7 @@ class ProcessLog:
 
 
 def start_logging(name: str) -> None:
-    """Log to standard error, for a command that is no process of a run.
+    """Log to standard error, for a command whose log has no options.
 
     Args:
         name: stands in each line, beside the time.
@@ -81,7 +80,7 @@ class _JsonFormatter(logging.Formatter):
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
             "run": self._log.run,
-            "role": self._log.role.value,
+            "role": self._log.name,
             "id": self._log.id,
             "message": plain_lines(record.getMessage()),
         }

@@ -67,7 +67,7 @@ def run_process(arguments: argparse.Namespace, role: Role, make: MakeProcess) ->
         UserError: the configuration is not valid, or the run already has such a process.
     """
     os.umask(PRIVATE)
-    log = ProcessLog(role, arguments)
+    log = ProcessLog(role.value, arguments)
     config = config_of(arguments)
     log.run = config.run.name
     lifecycle = Lifecycle()

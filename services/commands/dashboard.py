@@ -17,8 +17,8 @@ from proto.lifecycle import Lifecycle
 from proto.membership import METRICS_PERIOD_S
 from proto.permissions import Holder
 from proto.security import certificate_for
-from services.arguments.common import add_connection, config_of, integer
-from services.arguments.logs import start_logging
+from services.arguments.common import add_connection, add_log_options, config_of, integer
+from services.arguments.logs import ProcessLog
 from services.arguments.process import TRY_AGAIN_S, heartbeat, is_supervised
 from services.board import Board
 from services.dashboard.access import Access
@@ -35,6 +35,7 @@ PRESENT_WITHIN_S: Final = 2.5 * METRICS_PERIOD_S
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_connection(parser)
+    add_log_options(parser)
     parser.add_argument(
         "--port",
         type=integer(0, 2**16 - 1),
@@ -56,8 +57,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C or SIGTERM."""
-    start_logging("dashboard")
+    log = ProcessLog("dashboard", arguments)
     config = config_of(arguments)
+    log.run, log.id = config.run.name, f"dashboard-{os.getpid()}"
     host = arguments.host or config.dashboard.host
     access = Access.of(host, allow_control=arguments.allow_control)
     certificate_for(config.hub, Holder.WATCHER)  # so that what is wrong with it is told now

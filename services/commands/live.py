@@ -8,14 +8,15 @@ import os
 from proto.bus import join_hub
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
-from services.arguments.common import add_connection, config_of, listening_address
-from services.arguments.logs import start_logging
+from services.arguments.common import add_connection, add_log_options, config_of, listening_address
+from services.arguments.logs import ProcessLog
 from services.monitoring.live_view import LiveView
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_connection(parser)
+    add_log_options(parser)
     parser.add_argument(
         "--port",
         type=listening_address,
@@ -30,12 +31,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve viewers until Ctrl-C; a hub that does not answer is waited for."""
-    start_logging("live")
+    log = ProcessLog("live", arguments)
     config = config_of(arguments)
+    log.run, log.id = config.run.name, f"live-{os.getpid()}"
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
     host, port = arguments.port
-    bus = join_hub(config.hub, config.run.name, Role.WATCH, f"live-{os.getpid()}", lifecycle)
+    bus = join_hub(config.hub, config.run.name, Role.WATCH, log.id, lifecycle)
     if bus is not None:
         with bus:
             period_s = config.simulator.control_period_s

@@ -9,8 +9,8 @@ import os
 from proto.bus import Bus, join_hub
 from proto.keys import Role
 from proto.lifecycle import Lifecycle
-from services.arguments.common import add_connection, config_of, listening_address
-from services.arguments.logs import start_logging
+from services.arguments.common import add_connection, add_log_options, config_of, listening_address
+from services.arguments.logs import ProcessLog
 from services.board import Board, RunView
 from services.monitoring.exporter import RunCollector, served
 
@@ -20,6 +20,7 @@ LOG = logging.getLogger(__name__)
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     add_connection(parser)
+    add_log_options(parser)
     parser.add_argument(
         "--prometheus",
         type=listening_address,
@@ -31,8 +32,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve the metrics until Ctrl-C; a hub that does not answer is waited for."""
-    start_logging("metrics")
+    log = ProcessLog("metrics", arguments)
     config = config_of(arguments)
+    log.run, log.id = config.run.name, f"metrics-{os.getpid()}"
     lifecycle = Lifecycle()
     lifecycle.stop_on_signals()
     watched = _WatchedRun()
@@ -40,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
     collector = RunCollector(config.run.name, watched.view, watched.connected)
     with served(collector, host, port) as chosen:
         LOG.info("metrics of the run %s at http://%s:%d/metrics", config.run.name, host, chosen)
-        bus = join_hub(config.hub, config.run.name, Role.WATCH, f"metrics-{os.getpid()}", lifecycle)
+        bus = join_hub(config.hub, config.run.name, Role.WATCH, log.id, lifecycle)
         if bus is not None:
             with bus:
                 watched.join(bus)

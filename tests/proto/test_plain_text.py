@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 from run_metrics import ACTOR, EVALUATOR, LEARNER, view_of
 
-from proto.keys import Role
 from proto.plain_text import plain, plain_lines
 from services.arguments.logs import ProcessLog
 from services.board import RunView
@@ -83,7 +82,7 @@ def test_a_log_record_cannot_look_like_two(capfd: pytest.CaptureFixture[str]) ->
     root = logging.getLogger()
     before = root.handlers[:], root.level
     try:
-        ProcessLog(Role.ACTOR, Namespace(log_format="text", quiet=False, verbose=False))
+        ProcessLog("actor", Namespace(log_format="text", quiet=False, verbose=False))
         forged = "2026-01-01 00:00:00,000 learner ERROR lost everything"
         logging.getLogger("test").warning("refused: %s", f"x\n{forged}\x1b[2J")
         try:

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 
 import pytest
 
-from proto.keys import Role
 from services.arguments.logs import ProcessLog
 
 
@@ -26,7 +25,7 @@ def kept_logging() -> Iterator[None]:
 
 def log(**options: object) -> ProcessLog:
     given = {"log_format": "text", "quiet": False, "verbose": False, **options}
-    return ProcessLog(Role.ACTOR, Namespace(**given))
+    return ProcessLog("actor", Namespace(**given))
 
 
 def test_json_records_name_run_role_and_id(capfd: pytest.CaptureFixture[str]) -> None:
