@@ -36,6 +36,8 @@ Sizes = dict[str, int]
 """Named sizes found so far in a message, such as its number of steps T."""
 
 MEBIBYTE: Final = 1 << 20
+_COUNTED_FROM: Final = 64 * 1024
+"""The values in a smaller payload are not counted while it is decoded (bytes)."""
 _LONGEST_FIELD: Final = 300
 _LONGEST_PROBLEM: Final = 1000
 
@@ -49,9 +51,22 @@ class MessageError(Exception):
     """
 
     def __init__(self, field: str, problem: str) -> None:
+        super().__init__(field, problem)
         self.field = field[:_LONGEST_FIELD]
         self.problem = problem[:_LONGEST_PROBLEM]
-        super().__init__(f"{self.field}: {self.problem}")
+
+    def __str__(self) -> str:
+        return f"{self.field}: {self.problem}"
+
+    def prefix(self, outer: str) -> None:
+        """Put the path of what holds the field in front; paths are made for errors only."""
+        joint = "." if self.field[:1] not in ("", "[", " ") else ""
+        self.field = f"{outer}{joint}{self.field}"[:_LONGEST_FIELD]
+
+
+def _invalid(problem: str) -> MessageError:
+    """A problem of a value itself; what holds the value puts the path in front."""
+    return MessageError("", problem)
 
 
 class Check(Protocol):
@@ -60,16 +75,15 @@ class Check(Protocol):
     def pack(self, value: Any, /) -> Plain:
         """Convert a value to its plain form."""
 
-    def unpack(self, plain: Plain, where: str, sizes: Sizes, /) -> Any:
+    def unpack(self, plain: Plain, sizes: Sizes, /) -> Any:
         """Convert a plain form to the value.
 
         Args:
             plain: the plain form.
-            where: path of the field, for the error.
             sizes: named sizes of the message; the sizes of this field are added.
 
         Raises:
-            MessageError: the plain form is not valid for this field.
+            MessageError: the plain form is not valid for this field; its path begins here.
         """
 
     @property
@@ -95,11 +109,11 @@ class Integer(_Single):
     def pack(self, value: int) -> Plain:
         return int(value)
 
-    def unpack(self, plain: Plain, where: str, _sizes: Sizes) -> int:
+    def unpack(self, plain: Plain, _sizes: Sizes) -> int:
         if not isinstance(plain, int) or isinstance(plain, bool):
-            raise MessageError(where, f"expected an integer, got {_kind(plain)}")
+            raise _invalid(f"expected an integer, got {_kind(plain)}")
         if not self.least <= plain <= self.most:
-            raise MessageError(where, f"expected {self.least}..{self.most}, got {plain}")
+            raise _invalid(f"expected {self.least}..{self.most}, got {plain}")
         return plain
 
 
@@ -113,11 +127,11 @@ class Number(_Single):
     def pack(self, value: float) -> Plain:
         return float(value)
 
-    def unpack(self, plain: Plain, where: str, _sizes: Sizes) -> float:
+    def unpack(self, plain: Plain, _sizes: Sizes) -> float:
         if not isinstance(plain, int | float) or isinstance(plain, bool):
-            raise MessageError(where, f"expected a number, got {_kind(plain)}")
+            raise _invalid(f"expected a number, got {_kind(plain)}")
         if not self.least <= plain <= self.most:  # false for NaN as well
-            raise MessageError(where, f"expected {self.least:g}..{self.most:g}, got {plain}")
+            raise _invalid(f"expected {self.least:g}..{self.most:g}, got {plain}")
         return float(plain)
 
 
@@ -128,9 +142,9 @@ class Flag(_Single):
     def pack(self, value: bool) -> Plain:
         return bool(value)
 
-    def unpack(self, plain: Plain, where: str, _sizes: Sizes) -> bool:
+    def unpack(self, plain: Plain, _sizes: Sizes) -> bool:
         if not isinstance(plain, bool):
-            raise MessageError(where, f"expected true or false, got {_kind(plain)}")
+            raise _invalid(f"expected true or false, got {_kind(plain)}")
         return plain
 
 
@@ -144,18 +158,20 @@ class Text(_Single):
     def pack(self, value: str) -> Plain:
         return str(value)
 
-    def unpack(self, plain: Plain, where: str, _sizes: Sizes) -> str:
+    def unpack(self, plain: Plain, _sizes: Sizes) -> str:
         if not isinstance(plain, str):
-            raise MessageError(where, f"expected text, got {_kind(plain)}")
+            raise _invalid(f"expected text, got {_kind(plain)}")
         if len(plain) > self.longest:
-            raise MessageError(
-                where, f"expected at most {self.longest} characters, got {len(plain)}"
-            )
+            raise _invalid(f"expected at most {self.longest} characters, got {len(plain)}")
         if not plain.isprintable():  # keeps terminals safe from what is logged
-            raise MessageError(where, f"expected printable text, got {plain[:64]!a}")
-        if self.pattern is not None and re.fullmatch(self.pattern, plain) is None:
-            raise MessageError(where, f"expected {self.pattern}, got {plain[:64]!r}")
+            raise _invalid(f"expected printable text, got {plain[:64]!a}")
+        if self._fullmatch is not None and self._fullmatch(plain) is None:
+            raise _invalid(f"expected {self.pattern}, got {plain[:64]!r}")
         return plain
+
+    @cached_property
+    def _fullmatch(self) -> Callable[[str], re.Match[str] | None] | None:
+        return None if self.pattern is None else re.compile(self.pattern).fullmatch
 
 
 @dataclass(frozen=True)
@@ -168,9 +184,9 @@ class NumberOrText(_Single):
     def pack(self, value: float | str) -> Plain:
         return value if isinstance(value, str) else self.number.pack(value)
 
-    def unpack(self, plain: Plain, where: str, sizes: Sizes) -> float | str:
+    def unpack(self, plain: Plain, sizes: Sizes) -> float | str:
         check = self.text if isinstance(plain, str) else self.number
-        return check.unpack(plain, where, sizes)
+        return check.unpack(plain, sizes)
 
 
 @dataclass(frozen=True)
@@ -182,13 +198,16 @@ class Choice(_Single):
     def pack(self, value: Enum) -> Plain:
         return str(value.value)
 
-    def unpack(self, plain: Plain, where: str, _sizes: Sizes) -> Enum:
-        for member in self.members:
-            if isinstance(plain, str) and member.value == plain:
-                return member
-        known = ", ".join(str(member.value) for member in self.members)
+    def unpack(self, plain: Plain, _sizes: Sizes) -> Enum:
+        if isinstance(plain, str) and plain in self._by_value:
+            return self._by_value[plain]
+        known = ", ".join(self._by_value)
         got = ascii(plain[:64]) if isinstance(plain, str) else _kind(plain)
-        raise MessageError(where, f"expected one of {known}, got {got}")
+        raise _invalid(f"expected one of {known}, got {got}")
+
+    @cached_property
+    def _by_value(self) -> dict[str, Enum]:
+        return {str(member.value): member for member in self.members}
 
 
 @dataclass(frozen=True)
@@ -200,11 +219,11 @@ class Blob(_Single):
     def pack(self, value: bytes) -> Plain:
         return bytes(value)
 
-    def unpack(self, plain: Plain, where: str, _sizes: Sizes) -> bytes:
+    def unpack(self, plain: Plain, _sizes: Sizes) -> bytes:
         if not isinstance(plain, bytes):
-            raise MessageError(where, f"expected bytes, got {_kind(plain)}")
+            raise _invalid(f"expected bytes, got {_kind(plain)}")
         if not 1 <= len(plain) <= self.most:
-            raise MessageError(where, f"expected 1..{self.most} bytes, got {len(plain)}")
+            raise _invalid(f"expected 1..{self.most} bytes, got {len(plain)}")
         return plain
 
 
@@ -220,7 +239,7 @@ class Size:
     most: int
     varies: bool = False
 
-    def check(self, size: int, where: str, sizes: Sizes) -> None:
+    def check(self, size: int, sizes: Sizes) -> None:
         """Check the range of a size, and that it equals the size of this name in `sizes`.
 
         The first size of a name is added to `sizes`.
@@ -229,9 +248,9 @@ class Size:
             MessageError: the size is out of range or differs.
         """
         if not self.least <= size <= self.most:
-            raise MessageError(where, f"{self.name} = {size} is not in {self.least}..{self.most}")
+            raise _invalid(f"{self.name} = {size} is not in {self.least}..{self.most}")
         if not self.varies and sizes.setdefault(self.name, size) != size:
-            raise MessageError(where, f"{self.name} = {size}, but elsewhere {sizes[self.name]}")
+            raise _invalid(f"{self.name} = {size}, but elsewhere {sizes[self.name]}")
 
 
 @dataclass(frozen=True)
@@ -262,47 +281,45 @@ class Array:
         content = array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()
         return [name, list(array.shape), content]
 
-    def unpack(self, plain: Plain, where: str, sizes: Sizes) -> NDArray[Any]:
+    def unpack(self, plain: Plain, sizes: Sizes) -> NDArray[Any]:
         if not isinstance(plain, list) or len(plain) != 3:
-            raise MessageError(where, f"expected [dtype, shape, bytes], got {_kind(plain)}")
+            raise _invalid(f"expected [dtype, shape, bytes], got {_kind(plain)}")
         dtype, shape, content = plain
         if dtype != self.dtype:
-            raise MessageError(where, f"expected dtype {self.dtype}, got {_shown(dtype)}")
-        self._check_shape(shape, where, sizes)
+            raise _invalid(f"expected dtype {self.dtype}, got {_shown(dtype)}")
+        self._check_shape(shape, sizes)
         if not isinstance(content, bytes):
-            raise MessageError(where, f"expected bytes as content, got {_kind(content)}")
+            raise _invalid(f"expected bytes as content, got {_kind(content)}")
         expected = math.prod(shape) * self._little_endian.itemsize
         if len(content) != expected:
-            raise MessageError(where, f"expected {expected} bytes, got {len(content)}")
+            raise _invalid(f"expected {expected} bytes, got {len(content)}")
         # The copy is writable and in the machine's byte order.
         array = np.frombuffer(content, self._little_endian).reshape(shape).astype(self._native)
-        self._check_range(array, where)
+        self._check_range(array)
         return array
 
-    def _check_shape(self, shape: Plain, where: str, sizes: Sizes) -> None:
+    def _check_shape(self, shape: Plain, sizes: Sizes) -> None:
         whole = isinstance(shape, list) and all(type(size) is int for size in shape)
         if not whole or len(shape) != len(self.shape):
-            raise MessageError(where, f"expected shape {self._shape_text()}, got {_shown(shape)}")
+            raise _invalid(f"expected shape {self._shape_text()}, got {_shown(shape)}")
         for expected, got in zip(self.shape, shape, strict=True):
             if isinstance(expected, Size):
-                expected.check(got, where, sizes)
+                expected.check(got, sizes)
             elif expected != got:
-                raise MessageError(where, f"expected shape {self._shape_text()}, got {shape}")
+                raise _invalid(f"expected shape {self._shape_text()}, got {shape}")
 
     def _shape_text(self) -> str:
         names = (size.name if isinstance(size, Size) else str(size) for size in self.shape)
         return f"[{', '.join(names)}]"
 
-    def _check_range(self, array: NDArray[Any], where: str) -> None:
+    def _check_range(self, array: NDArray[Any]) -> None:
         if array.size == 0:
             return
         lowest, highest = float(array.min()), float(array.max())  # NaN if an element is NaN
         if not (math.isfinite(lowest) and math.isfinite(highest)):
-            raise MessageError(where, "expected finite numbers, got NaN or infinity")
+            raise _invalid("expected finite numbers, got NaN or infinity")
         if not (self.least <= lowest and highest <= self.most):
-            raise MessageError(
-                where, f"expected {self.least:g}..{self.most:g}, got {lowest:g}..{highest:g}"
-            )
+            raise _invalid(f"expected {self.least:g}..{self.most:g}, got {lowest:g}..{highest:g}")
 
 
 @dataclass(frozen=True)
@@ -318,8 +335,8 @@ class Maybe:
     def pack(self, value: Any) -> Plain:
         return None if value is None else self.item.pack(value)
 
-    def unpack(self, plain: Plain, where: str, sizes: Sizes) -> Any:
-        return None if plain is None else self.item.unpack(plain, where, sizes)
+    def unpack(self, plain: Plain, sizes: Sizes) -> Any:
+        return None if plain is None else self.item.unpack(plain, sizes)
 
 
 @dataclass(frozen=True)
@@ -344,13 +361,22 @@ class Many:
     def pack(self, value: Sequence[Any]) -> Plain:
         return [self.item.pack(item) for item in value]
 
-    def unpack(self, plain: Plain, where: str, sizes: Sizes) -> tuple[Any, ...]:
+    def unpack(self, plain: Plain, sizes: Sizes) -> tuple[Any, ...]:
         if not isinstance(plain, list):
-            raise MessageError(where, f"expected a list, got {_kind(plain)}")
-        self.size.check(len(plain), where, sizes)
-        return tuple(
-            self.item.unpack(item, f"{where}[{index}]", sizes) for index, item in enumerate(plain)
-        )
+            raise _invalid(f"expected a list, got {_kind(plain)}")
+        self.size.check(len(plain), sizes)
+        unpack = self.item.unpack
+        items: list[Any] = []
+        try:
+            for item in plain:
+                items.append(unpack(item, sizes))  # noqa: PERF401 (the error needs the index)
+        except MessageError as error:
+            error.prefix(f"[{len(items)}]")
+            raise
+        return tuple(items)
+
+
+_NAME: Final = Text(64)
 
 
 @dataclass(frozen=True)
@@ -367,18 +393,20 @@ class Table:
     def pack(self, value: Mapping[str, Any]) -> Plain:
         return {str(key): self.item.pack(item) for key, item in value.items()}
 
-    def unpack(self, plain: Plain, where: str, sizes: Sizes) -> dict[str, Any]:
+    def unpack(self, plain: Plain, sizes: Sizes) -> dict[str, Any]:
         if not isinstance(plain, dict):
-            raise MessageError(where, f"expected a map, got {_kind(plain)}")
+            raise _invalid(f"expected a map, got {_kind(plain)}")
         if len(plain) > self.most:
-            raise MessageError(where, f"expected at most {self.most} entries, got {len(plain)}")
-        name = Text(64)
-        return {
-            name.unpack(key, f"{where} (a key)", sizes): self.item.unpack(
-                item, f"{where}[{_shown(key)}]", sizes
-            )
-            for key, item in plain.items()
-        }
+            raise _invalid(f"expected at most {self.most} entries, got {len(plain)}")
+        unpack = self.item.unpack
+        values: dict[str, Any] = {}
+        for key, item in plain.items():
+            try:
+                values[_NAME.unpack(key, sizes)] = unpack(item, sizes)
+            except MessageError as error:
+                error.prefix(f"[{_shown(key)}]")
+                raise
+        return values
 
 
 @dataclass(frozen=True)
@@ -396,27 +424,43 @@ class Record:
         return 1 + sum(check.most_values for check in self.fields.values())
 
     def pack(self, value: Any) -> Plain:
-        return {
-            name: check.pack(getattr(value, name))
-            for name, check in self.fields.items()
-            if not (isinstance(check, Added) and getattr(value, name) is None)
-        }
+        plain = {name: pack(getattr(value, name)) for name, pack in self._packing}
+        for name in self._added:
+            if plain[name] is None:
+                del plain[name]
+        return plain
 
-    def unpack(self, plain: Plain, where: str, sizes: Sizes) -> Any:
+    @cached_property
+    def _packing(self) -> tuple[tuple[str, Callable[[Any], Plain]], ...]:
+        return tuple((name, check.pack) for name, check in self.fields.items())
+
+    @cached_property
+    def _added(self) -> tuple[str, ...]:
+        return tuple(name for name, check in self.fields.items() if isinstance(check, Added))
+
+    def unpack(self, plain: Plain, sizes: Sizes) -> Any:
         if not isinstance(plain, dict):
-            raise MessageError(where or "payload", f"expected a map of fields, got {_kind(plain)}")
-        for name in plain:
-            if name not in self.fields:
-                raise MessageError(_path(where, _shown(name)), "is not a field of this message")
+            raise _invalid(f"expected a map of fields, got {_kind(plain)}")
+        if not plain.keys() <= self.fields.keys():
+            unknown = next(name for name in plain if name not in self.fields)
+            raise MessageError(_shown(unknown), "is not a field of this message")
         values = {}
-        for name, check in self.fields.items():
-            if name not in plain and not isinstance(check, Added):
-                raise MessageError(_path(where, name), "is missing")
-            values[name] = check.unpack(plain.get(name), _path(where, name), sizes)
+        name = ""
+        try:
+            for name, check in self.fields.items():
+                if name in plain:
+                    values[name] = check.unpack(plain[name], sizes)
+                elif name in self._added:
+                    values[name] = None
+                else:
+                    raise _invalid("is missing")
+        except MessageError as error:
+            error.prefix(name)
+            raise
         try:
             return self.record_class(**values)
         except ValueError as error:  # each field is valid, but not their combination
-            raise MessageError(where or "payload", str(error)) from error
+            raise _invalid(str(error)) from error
 
 
 @dataclass(frozen=True)
@@ -442,10 +486,19 @@ class Schema:
         """Largest number of lists, maps and their items in a valid payload."""
         return self.record.most_values
 
-    @property
+    @cached_property
     def encoding(self) -> str:
         """Zenoh encoding, such as `application/msgpack;vmdnn.receipt.1`."""
         return f"application/{self.form};vmdnn.{self.name}.{self.version}"
+
+    def unpack(self, plain: Plain) -> Any:
+        """Convert a plain form to the message; raises MessageError."""
+        try:
+            return self.record.unpack(plain, {})
+        except MessageError as error:
+            if not error.field:
+                error.prefix("payload")
+            raise
 
 
 @dataclass(frozen=True)
@@ -462,6 +515,7 @@ class Wire:
 
 
 Message = TypeVar("Message")
+_JSON: Final = json.JSONEncoder(allow_nan=False)
 _SCHEMAS: Final[dict[type[Any], Schema]] = {}
 
 
@@ -503,11 +557,8 @@ def encode(value: Any, *, check: bool = True) -> Wire:
     schema = _SCHEMAS[type(value)]
     plain = schema.record.pack(value)
     if check:
-        schema.record.unpack(plain, "", {})
-    if schema.form == "json":
-        payload = json.dumps(plain, allow_nan=False).encode()
-    else:
-        payload = msgpack.packb(plain)
+        schema.unpack(plain)
+    payload = _JSON.encode(plain).encode() if schema.form == "json" else msgpack.packb(plain)
     check_size(len(payload), schema.encoding, type(value))
     return Wire(schema.encoding, payload)
 
@@ -526,7 +577,7 @@ def decode(wire: Wire, *classes: type[Message], limit: int | None = None) -> Mes
     schema = _schema_by(wire.encoding, classes)
     check_size(len(wire.payload), wire.encoding, *classes, limit=limit)
     read = _read_json if schema.form == "json" else _read_msgpack
-    value: Message = schema.record.unpack(read(wire.payload, schema.most_values), "", {})
+    value: Message = schema.unpack(read(wire.payload, schema.most_values))
     return value
 
 
@@ -543,22 +594,21 @@ def check_size(size: int, encoding: str, *classes: type[Any], limit: int | None 
 
 
 def _schema_by(encoding: str, classes: Sequence[type[Any]]) -> Schema:
-    schemas = [_SCHEMAS[message_class] for message_class in classes]
-    schema = next((schema for schema in schemas if schema.encoding == encoding), None)
-    if schema is None:
-        expected = " or ".join(schema.encoding for schema in schemas)
-        raise MessageError(
-            "encoding",
-            f"expected {expected}, got {encoding[:128]!a}: do both ends run the same "
-            "version of vmdnn?",
-        )
-    return schema
+    for message_class in classes:
+        schema = _SCHEMAS[message_class]
+        if schema.encoding == encoding:
+            return schema
+    expected = " or ".join(_SCHEMAS[message_class].encoding for message_class in classes)
+    raise MessageError(
+        "encoding",
+        f"expected {expected}, got {encoding[:128]!a}: do both ends run the same version of vmdnn?",
+    )
 
 
 class _Budget:
-    """Counts lists, maps and their items while a payload is decoded.
+    """Counts lists, maps and their items while a large payload is decoded.
 
-    A byte of msgpack can be a map, which takes 64 bytes of memory.
+    A byte of msgpack can be a map, which takes 64 bytes of memory. A small payload can do no harm.
     """
 
     def __init__(self, most: int) -> None:
@@ -583,24 +633,22 @@ class _Budget:
 
 
 def _read_msgpack(payload: bytes, most_values: int) -> Plain:
-    budget = _Budget(2 * most_values)  # an item that is a list or a map counts twice
+    hooks: dict[str, Any] = {}
+    if len(payload) >= _COUNTED_FROM:
+        budget = _Budget(2 * most_values)  # an item that is a list or a map counts twice
+        hooks = {"list_hook": budget.list_hook, "object_pairs_hook": budget.map_hook}
     try:
         return msgpack.unpackb(
-            payload,
-            list_hook=budget.list_hook,
-            object_pairs_hook=budget.map_hook,
-            max_array_len=most_values,
-            max_map_len=most_values,
-            max_ext_len=0,
+            payload, max_array_len=most_values, max_map_len=most_values, max_ext_len=0, **hooks
         )
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
         raise MessageError("payload", f"is not msgpack: {str(error)[:128]}") from error
 
 
 def _read_json(payload: bytes, most_values: int) -> Plain:
-    budget = _Budget(2 * most_values)
+    hook = _Budget(2 * most_values).map_hook if len(payload) >= _COUNTED_FROM else None
     try:
-        return json.loads(payload, object_pairs_hook=budget.map_hook)
+        return json.loads(payload, object_pairs_hook=hook)
     except (ValueError, RecursionError) as error:
         raise MessageError("payload", f"is not JSON: {str(error)[:128]}") from error
 
@@ -640,10 +688,6 @@ def _check_of(hint: Any, where: str) -> Check:
     if dataclasses.is_dataclass(hint) and isinstance(hint, type):
         return record_of(hint)
     raise TypeError(f"{where}: write Annotated[{hint}, ...] to say how it is checked")
-
-
-def _path(where: str, name: str) -> str:
-    return f"{where}.{name}" if where else name
 
 
 def _shown(plain: Plain) -> str:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final
 
 from proto.keys import Role
@@ -26,6 +27,8 @@ from proto.messages import (
 )
 from proto.metrics import Metrics
 
+_ROLES: Final = frozenset(Role)
+_SENDERS_REMEMBERED: Final = 1024
 _ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -37,10 +40,11 @@ class Sender:
     id: str
 
     @classmethod
+    @lru_cache(_SENDERS_REMEMBERED)
     def parse(cls, text: str) -> Sender | None:
         """Read `role/id`; None if it is not that."""
         role, _, name = text.partition("/")
-        if role not in list(Role) or not is_id(name):
+        if role not in _ROLES or not is_id(name):
             return None
         return cls(Role(role), name)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from typing import Final
 
 from actors.disturbances.staging import check_suite
@@ -39,7 +39,8 @@ from proto.plain_text import plain
 from proto.players import Players
 from proto.situations import situation_of
 from proto.storage import make_folder
-from proto.suites import Player, Suite
+from proto.suites import Conditions, Player, Suite
+from proto.variables import Situation
 from services.trials.asked import AskedTrials, NotYetError
 from services.trials.run_folder import trial_log_file
 from services.trials.success import Tally
@@ -61,7 +62,11 @@ VERSIONS_NAMED: Final = 20
 """The log names so many versions in one line."""
 REASONS_TOLD: Final = 31
 """The metrics name so many reasons of a version; the others are summed up."""
+SEEDS_REMEMBERED: Final = 10_000
+"""Of so many seeds it remembers what they stand for. Each policy is tried with the same ones."""
 
+TrialGroup = tuple[PolicyKey, str]
+"""Identifies the trials of a policy in a suite."""
 TrialKey = tuple[PolicyKey, str, int]
 """Identifies a trial: the policy, the name of the suite, and the seed."""
 
@@ -103,6 +108,8 @@ class Evaluator:
         self._failures: Failures[TrialKey] = Failures()
         self._taken: list[EpisodeOutcome] = []  # to be counted and answered
         self._task = task
+        self._meaning = lru_cache(SEEDS_REMEMBERED)(self._drawn)
+        self._scores: dict[TrialGroup, PolicyScore] = {}
         self._agreement = Agreement(config, bus)
         self._folder = config.run_folder / "evaluation"
         self._asked: AskedTrials[tuple[str, int]] = AskedTrials(
@@ -174,10 +181,17 @@ class Evaluator:
             trials=len(suite.test_seeds),
             unplayable=self._unplayable.get(suite.name, ""),
             policies=tuple(
-                _score(version, self._counted((run_id, version), suite).values())
+                self._score((run_id, version), suite)
                 for version in self._log.versions(run_id, suite.name)[-VERSIONS_TOLD:]
             ),
         )
+
+    def _score(self, policy: PolicyKey, suite: Suite) -> PolicyScore:
+        """The score of a policy, computed again only when more of its trials have been counted."""
+        counted, known = self._counted(policy, suite), self._scores.get((policy, suite.name))
+        if known is None or known.trials != len(counted):
+            known = self._scores[policy, suite.name] = _score(policy[1], counted.values())
+        return known
 
     @property
     def _done(self) -> bool:
@@ -262,7 +276,7 @@ class Evaluator:
 
     def _missing(self, policy: PolicyKey, suite: Suite, first: int | None = None) -> list[int]:
         """The first trials of a suite, or all, that are not counted yet."""
-        counted = self._counted(policy, suite)
+        counted = self._log.seeds(*policy, suite.name)
         return [seed for seed in suite.test_seeds[:first] if seed not in counted]
 
     @property
@@ -425,14 +439,20 @@ class Evaluator:
 
     def _conditions_problem(self, played: EpisodeOutcome | EpisodeFailed, suite: Suite) -> str:
         """Why an episode is not what its seed stands for in a suite; empty if it is."""
-        conditions = suite.conditions(played.seed)
+        conditions, situation = self._meaning(suite.name, played.seed, played.kind)
         if played.conditions != conditions:
             return f"the suite {suite.name} asks for other conditions with the seed {played.seed}"
         if isinstance(played, EpisodeOutcome) and played.backend != suite.backend:
             return f"the suite {suite.name} is played in {suite.backend}, not in {played.backend}"
-        if not same_situation(played.situation, situation_of(self._task, conditions, played.seed)):
+        if not same_situation(played.situation, situation):
             return f"its situation is not the one of the seed {played.seed}"
         return ""
+
+    def _drawn(self, name: str, seed: int, kind: Kind) -> tuple[Conditions | None, Situation]:
+        """What a seed stands for in a suite."""
+        suites = self._suites if kind is Kind.TRIAL else self._practised
+        conditions = suites[name].conditions(seed)
+        return conditions, situation_of(self._task, conditions, seed)
 
     def _asked_problem(self, played: EpisodeOutcome | EpisodeFailed, suite: Suite) -> str:
         """Why an episode was not asked for; empty if it was, or was counted before."""
@@ -440,7 +460,7 @@ class Evaluator:
         problem = self._asked.policy_problem(policy)
         if problem or played.kind is Kind.PRACTICE:
             return problem
-        if played.seed in self._counted(policy, suite):
+        if played.seed in self._log.seeds(*policy, suite.name):
             return ""
         return self._asked.trial_problem(policy, (suite.name, played.seed), played.actor)
 

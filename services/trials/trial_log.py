@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -95,9 +95,9 @@ class CountedTrial:
             conditions=episode.conditions,
         )
 
-    def line(self) -> bytes:
-        """Return the line of JSON, with a line break at its end."""
-        return encode(self).payload + b"\n"
+    def line(self, *, check: bool = True) -> bytes:
+        """Return the line of JSON, with a line break at its end; arguments as in `encode`."""
+        return encode(self, check=check).payload + b"\n"
 
 
 def _format_with(conditions: Conditions | None) -> int:
@@ -200,7 +200,7 @@ class TrialLog:
         return self._add(CountedTrial.of(rollout.episode, rollout.run_id))
 
     def add_outcomes(self, played: Iterable[EpisodeOutcome]) -> list[EpisodeOutcome]:
-        """Write trials to disk, all at once, and count them.
+        """Write trials that came over the bus to disk, all at once, and count them.
 
         Returns:
             Those that were not counted before.
@@ -216,7 +216,9 @@ class TrialLog:
                 new.setdefault(key, each)
         trials = [CountedTrial.of(each, each.training) for each in new.values()]
         if trials:
-            append_line(self._path, b"".join(trial.line() for trial in trials))
+            # The fields of a message were checked when it was decoded.
+            lines = b"".join(trial.line(check=False) for trial in trials)
+            append_line(self._path, lines)
         for trial in trials:
             self._count(trial)
         return list(new.values())
@@ -246,6 +248,10 @@ class TrialLog:
         """Return the policy versions of a training with trials in any suite, oldest first."""
         return sorted({version for run, version, _ in list(self._trials) if run == run_id})
 
+    def seeds(self, run_id: str, policy_version: int, suite: str = UNLEARNED) -> Container[int]:
+        """Return the seeds of the counted trials of a policy version in a suite."""
+        return self._trials.get((run_id, policy_version, suite), {})
+
     def outcomes(
         self, run_id: str, policy_version: int, suite: str = UNLEARNED
     ) -> Mapping[int, Outcome]:
@@ -260,7 +266,7 @@ class TrialLog:
         return list(self._trials.get((run_id, policy_version, suite), {}).values())
 
     def _add(self, trial: CountedTrial) -> bool:
-        if trial.seed in self.outcomes(trial.run_id, trial.policy_version, trial.suite):
+        if trial.seed in self.seeds(trial.run_id, trial.policy_version, trial.suite):
             return False
         append_line(self._path, trial.line())
         return self._count(trial)
