@@ -278,9 +278,9 @@ class Bus:
         """Publish an encoded message that may be lost."""
         self._put(key, wire, zenoh.CongestionControl.DROP)
 
-    def deliver(self, key: str, message: Any) -> None:
-        """Publish a message; waits while the link is full."""
-        self.deliver_wire(key, encode(message))
+    def deliver(self, key: str, message: Any, *, check: bool = True) -> None:
+        """Publish a message; waits while the link is full. Arguments as in `publish`."""
+        self.deliver_wire(key, encode(message, check=check))
 
     def deliver_wire(self, key: str, wire: Wire) -> None:
         """Publish an encoded message; waits while the link is full."""

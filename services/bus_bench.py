@@ -54,6 +54,8 @@ LIMIT_S: Final = 25.0
 START_WITHIN_S: Final = 60.0
 DRAIN_S: Final = 3.0
 RUN: Final = "bench"
+TICK_S: Final = 1 / os.sysconf("SC_CLK_TCK")
+"""The least processor time that the kernel tells apart."""
 TRIALS: Final = 100
 VERSION: Final = 1000
 """The published policy. Trials of all versions before it count, so there are enough of them."""
@@ -76,6 +78,7 @@ class Flow:
         of_raw: per_s in relation to raw_per_s.
         hub_ms: processor time of the hub for each episode (ms).
         receiver_ms: processor time of evaluator or learner for each episode (ms).
+        receiver_per_s: episodes for which a second of their processor time is enough.
         hub_mib: memory of the hub (MiB).
         receiver_mib: memory of evaluator or learner (MiB).
     """
@@ -88,6 +91,7 @@ class Flow:
     of_raw: float
     hub_ms: float
     receiver_ms: float
+    receiver_per_s: float
     hub_mib: float
     receiver_mib: float
 
@@ -261,6 +265,7 @@ class _Bench:
             of_raw=per_s / raw_per_s,
             hub_ms=1e3 * used["hub"] / len(times),
             receiver_ms=1e3 * used[receiver] / len(times),
+            receiver_per_s=len(times) / max(used[receiver], TICK_S),
             hub_mib=_memory_mib(self._pids["hub"]),
             receiver_mib=_memory_mib(self._pids[receiver]),
         )
@@ -531,7 +536,7 @@ def _free_endpoint() -> str:
 def _processor_s(pid: int) -> float:
     """Processor time of a process (s)."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    return (int(fields[11]) + int(fields[12])) * TICK_S
 
 
 def _memory_mib(pid: int) -> float:

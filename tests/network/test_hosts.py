@@ -146,7 +146,8 @@ def test_a_run_on_four_hosts_survives_a_bad_link(played: Run, trouble: tuple[str
     assert set(keys.values()) == {1}
     assert len({trial["episode"] for trial in trials}) == len(trials)
     recorded = {
-        file.stem for file in (played.counting.folder / "runs" / RUN).glob("rollouts/*.mcap")
+        file.stem.rpartition("_")[2]
+        for file in (played.counting.folder / "runs" / RUN).glob("rollouts/*.mcap")
     }
     assert {trial["episode"] for trial in trials} <= recorded
     tutored = [
