@@ -166,8 +166,10 @@ class SmokeJobs:
 
 
 def test_a_run_whose_time_is_over_is_queued_again_and_ends(slurm: Slurm, tmp_path: Path) -> None:
-    jobs = SmokeJobs(slurm, tmp_path, "--time=3")  # the warning comes two minutes before the end
-    eventually(lambda: any(jobs.run.glob("tutoring/*.mcap")), "a sequence is kept", 180)
+    jobs = SmokeJobs(slurm, tmp_path, "--time=60")
+    eventually(lambda: any(jobs.run.glob("tutoring/*.mcap")), "a sequence is kept", 300)
+    # The warning comes two minutes before the end: now.
+    slurm.tell("scontrol", "update", f"JobId={jobs.services}", "EndTime=now+2minutes")
     eventually(lambda: slurm.restarts(jobs.services) == 1, "it is queued again", 240)
     assert "stopping" in jobs.log()
     assert not any((jobs.run / "tutoring").glob("*.part")), "no file is left half"
@@ -189,7 +191,7 @@ def test_a_run_whose_time_is_over_is_queued_again_and_ends(slurm: Slurm, tmp_pat
 
 def test_a_cancelled_run_leaves_nothing_behind(slurm: Slurm, tmp_path: Path) -> None:
     jobs = SmokeJobs(slurm, tmp_path)
-    eventually(lambda: any(jobs.run.glob("tutoring/*.mcap")), "a sequence is kept", 180)
+    eventually(lambda: any(jobs.run.glob("tutoring/*.mcap")), "a sequence is kept", 300)
     assert len(jobs.processes()) >= 6
     slurm.tell("scancel", jobs.services)
     eventually(lambda: slurm.queued() == [], "no job is left", 120)
