@@ -519,14 +519,14 @@ class Bus:
         """Decode what was received; the message, and its sender if the attachment names one."""
         key = str(received.key_expr)
         encoding = str(received.encoding)
+        content, note = received.payload, received.attachment
         name, sender, attachment = key, None, None
         try:
-            if received.attachment is not None:
-                attachment = Attachment.read(received.attachment)
+            if note is not None:
+                attachment = Attachment.read(note)
                 name, sender = f"{attachment.sender} ({key})", Sender.parse(attachment.sender)
-            size = 0 if received.payload is None else len(received.payload)
-            check_size(size, encoding, *classes, limit=limit)
-            payload = b"" if received.payload is None else received.payload.to_bytes()
+            check_size(0 if content is None else len(content), encoding, *classes, limit=limit)
+            payload = b"" if content is None else content.to_bytes()
             if attachment is not None:
                 attachment.check(payload)
             message = decode(Wire(encoding, payload), *classes, limit=limit)
