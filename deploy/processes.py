@@ -81,8 +81,9 @@ def programs(
             memory_mib=4096,
             volume_gib=10,
         ),
-        program(Role.EVALUATOR, volume_gib=1),
+        # They are stopped the other way round: what the evaluator has counted is still recorded.
         program(Role.RECORDER, volume_gib=round(config.recorder.keep.gib) + 5),  # trials are kept
+        program(Role.EVALUATOR, volume_gib=1),
     ]
     present = {backend: number for backend, number in actors.items() if number}
     for backend, number in present.items():
