@@ -435,6 +435,10 @@ class Record:
         return tuple((name, check.pack) for name, check in self.fields.items())
 
     @cached_property
+    def _unpacking(self) -> tuple[tuple[str, Callable[[Plain, Sizes], Any]], ...]:
+        return tuple((name, check.unpack) for name, check in self.fields.items())
+
+    @cached_property
     def _added(self) -> tuple[str, ...]:
         return tuple(name for name, check in self.fields.items() if isinstance(check, Added))
 
@@ -447,9 +451,9 @@ class Record:
         values = {}
         name = ""
         try:
-            for name, check in self.fields.items():
+            for name, unpack in self._unpacking:
                 if name in plain:
-                    values[name] = check.unpack(plain[name], sizes)
+                    values[name] = unpack(plain[name], sizes)
                 elif name in self._added:
                     values[name] = None
                 else:
@@ -490,6 +494,12 @@ class Schema:
     def encoding(self) -> str:
         """Zenoh encoding, such as `application/msgpack;vmdnn.receipt.1`."""
         return f"application/{self.form};vmdnn.{self.name}.{self.version}"
+
+    def check_size(self, size: int, limit: int | None = None) -> None:
+        """Raise MessageError if a payload is larger than `self.limit`, or than `limit`."""
+        most = self.limit if limit is None else min(limit, self.limit)
+        if size > most:
+            raise MessageError("payload", f"expected at most {most} bytes, got {size}")
 
     def unpack(self, plain: Plain) -> Any:
         """Convert a plain form to the message; raises MessageError."""
@@ -559,7 +569,7 @@ def encode(value: Any, *, check: bool = True) -> Wire:
     if check:
         schema.unpack(plain)
     payload = _JSON.encode(plain).encode() if schema.form == "json" else msgpack.packb(plain)
-    check_size(len(payload), schema.encoding, type(value))
+    schema.check_size(len(payload))
     return Wire(schema.encoding, payload)
 
 
@@ -575,7 +585,7 @@ def decode(wire: Wire, *classes: type[Message], limit: int | None = None) -> Mes
         MessageError: it is a message of another class or version, or a field is not valid.
     """
     schema = _schema_by(wire.encoding, classes)
-    check_size(len(wire.payload), wire.encoding, *classes, limit=limit)
+    schema.check_size(len(wire.payload), limit)
     read = _read_json if schema.form == "json" else _read_msgpack
     value: Message = schema.unpack(read(wire.payload, schema.most_values))
     return value
@@ -587,10 +597,7 @@ def check_size(size: int, encoding: str, *classes: type[Any], limit: int | None 
     Raises:
         MessageError: it is too large, or of none of `classes`.
     """
-    schema = _schema_by(encoding, classes)
-    most = schema.limit if limit is None else min(limit, schema.limit)
-    if size > most:
-        raise MessageError("payload", f"expected at most {most} bytes, got {size}")
+    _schema_by(encoding, classes).check_size(size, limit)
 
 
 def _schema_by(encoding: str, classes: Sequence[type[Any]]) -> Schema:
