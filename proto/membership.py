@@ -46,12 +46,15 @@ def membership(bus: Bus, participant: Participant, lifecycle: Lifecycle) -> Iter
     def on_control(control: Control) -> ControlReply:
         return ControlReply(bus.role, bus.id, _obey(control.command, participant, lifecycle))
 
+    joined_s = time.monotonic()
+
     def publish_metrics() -> None:
         lifecycle.log_wait()
         metrics = replace(
             participant.metrics(),
             waiting_for=lifecycle.waiting_for[:500],
             certificate_days=_certificate_days(bus),
+            running_s=time.monotonic() - joined_s,
         )
         bus.publish(bus.keys.metrics(bus.role, bus.id), metrics)
 

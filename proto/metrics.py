@@ -44,6 +44,7 @@ class Metrics:
         waiting_for: what the process waits for, such as the hub; empty while it works.
         certificate_days: days until its certificate expires, in the last 30; null before, and
             without security.
+        running_s: time since the process joined the run (s).
     """
 
     role: Role
@@ -52,9 +53,10 @@ class Metrics:
     refused: Count
     waiting_for: Annotated[str, Text(500)] = ""
     certificate_days: Annotated[int | None, Maybe(Integer(0, 30))] = None
+    running_s: Annotated[float, Number(0.0, 1e10)] = 0.0
 
 
-@message("metrics.actor", 4, form="json")
+@message("metrics.actor", 5, form="json")
 @dataclass(frozen=True, kw_only=True)
 class ActorMetrics(Metrics):
     """Metrics of an actor.
@@ -126,7 +128,7 @@ Epochs = Annotated[
 ]
 
 
-@message("metrics.learner", 5, form="json")
+@message("metrics.learner", 6, form="json")
 @dataclass(frozen=True, kw_only=True)
 class LearnerMetrics(Metrics):
     """Metrics of the learner.
@@ -242,7 +244,7 @@ class SuiteScore:
     policies: Scores
 
 
-@message("metrics.evaluator", 2, form="json", limit=16 * MEBIBYTE)
+@message("metrics.evaluator", 3, form="json", limit=16 * MEBIBYTE)
 @dataclass(frozen=True, kw_only=True)
 class EvaluatorMetrics(Metrics):
     """Metrics of the evaluator.
@@ -267,7 +269,7 @@ class EvaluatorMetrics(Metrics):
     done: bool
 
 
-@message("metrics.recorder", 2, form="json")
+@message("metrics.recorder", 3, form="json")
 @dataclass(frozen=True, kw_only=True)
 class RecorderMetrics(Metrics):
     """Metrics of the recorder.
@@ -287,7 +289,7 @@ class RecorderMetrics(Metrics):
     deleted: Count
 
 
-@message("metrics.hub", 2, form="json")
+@message("metrics.hub", 3, form="json")
 @dataclass(frozen=True, kw_only=True)
 class HubMetrics(Metrics):
     """Metrics of the hub.

@@ -41,6 +41,7 @@ from proto.situations import situation_of
 from proto.storage import make_folder
 from proto.suites import Conditions, Player, Suite
 from proto.variables import Situation
+from services.terminal.run_words import outcome_words
 from services.trials.asked import AskedTrials, NotYetError
 from services.trials.run_folder import trial_log_file
 from services.trials.success import Tally
@@ -347,7 +348,7 @@ class Evaluator:
         taken, self._taken = self._taken, []
         trials = [played for played in taken if played.kind is Kind.TRIAL]
         for played in when_disk_allows(self._lifecycle, lambda: self._log.add_outcomes(trials)):
-            _report_trial(played, played.outcome.reason)
+            _report_trial(played, outcome_words(played.outcome.reason))
         for played in trials:
             policy = (played.training, played.policy_version)
             self._leases.finish((policy, played.suite, played.seed))

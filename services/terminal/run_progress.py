@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from proto.metrics import ActorMetrics, LearnerMetrics, Stage, SuiteScore
+from proto.metrics import ActorMetrics, LearnerMetrics, Metrics, Stage, SuiteScore
 from services.board import RunView
 
 
@@ -17,7 +17,7 @@ class Progress:
     """How far a run is in time.
 
     Attributes:
-        elapsed_s: time since the run was started or continued (s); None if this is not known.
+        elapsed_s: time since the run was started or continued (s); None if no process is there.
         left_s: time that is left (s); None if it cannot be estimated yet, or the work is done.
         at_least: whether more time is needed, for work whose speed is not known yet.
     """
@@ -51,8 +51,8 @@ class ProgressMeter:
         """Begin without any measurement.
 
         Args:
-            started_s: when the run was started or continued, in the time of `clock`; None if this
-                is not known.
+            started_s: when the run was started or continued, in the time of `clock`; without it,
+                when the process that has been there for the longest time joined it.
             clock: gives the time in seconds.
         """
         self._started_s = started_s
@@ -64,7 +64,7 @@ class ProgressMeter:
     def look(self, view: RunView) -> Progress:
         """Take in a view; return how far the run is."""
         now_s = self._clock()
-        elapsed_s = None if self._started_s is None else now_s - self._started_s
+        elapsed_s = self._elapsed(view, now_s)
         learner = next(iter(view.living(LearnerMetrics)), None)
         if learner is None:
             self._last = None
@@ -78,6 +78,11 @@ class ProgressMeter:
         self._last = now_s, done, list(_present_work(view, learner))
         left_s, at_least = self._left(_left(view, learner))
         return Progress(elapsed_s, left_s, at_least)
+
+    def _elapsed(self, view: RunView, now_s: float) -> float | None:
+        if self._started_s is not None:
+            return now_s - self._started_s
+        return max((each.running_s for each in view.living(Metrics)), default=None)
 
     def _left(self, left: Mapping[_Work, int]) -> tuple[float | None, bool]:
         """Estimate the time of some work (s), and whether a part of it is not in the estimate."""

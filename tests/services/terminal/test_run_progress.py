@@ -72,4 +72,12 @@ def test_what_is_left_follows_from_the_speed_of_each_kind_of_work() -> None:
 
 def test_without_a_learner_nothing_is_estimated() -> None:
     clock = Clock()
-    assert ProgressMeter(clock=clock).look(view_of(ACTOR)) == Progress()
+    assert ProgressMeter(clock=clock).look(view_of()) == Progress()
+    running = replace(ACTOR, running_s=65.0)
+    assert ProgressMeter(clock=clock).look(view_of(running)) == Progress(65.0)
+
+
+def test_a_viewer_takes_the_time_of_the_process_that_has_run_for_the_longest_time() -> None:
+    learner, restarted = replace(LEARNER, running_s=4000.0), replace(ACTOR, running_s=3.0)
+    assert ProgressMeter().look(view_of(learner, restarted)).elapsed_s == 4000.0
+    assert ProgressMeter().look(view_of(restarted)).elapsed_s == 3.0
