@@ -483,9 +483,12 @@ def test_a_finished_policy_is_not_overwritten_by_another_network(
 ) -> None:
     setup.start("--set", "learner.epochs=8")
     setup.show_all()
-    metrics = setup.wait_for_metrics(lambda metrics: metrics.stage is Stage.FINISHED)
+    # The last epoch is over for a moment before its policy is published.
+    metrics = setup.wait_for_metrics(
+        lambda metrics: metrics.stage is Stage.FINISHED and metrics.policy_version == 2
+    )
     eventually(lambda: [p.epoch for p in setup.policies] == [5, 8], "two policies")
-    assert (metrics.epoch, metrics.epochs_total, metrics.policy_version) == (8, 8, 2)
+    assert (metrics.epoch, metrics.epochs_total) == (8, 8)
     assert not metrics.done, "the configuration asks for three versions"
     assert stop(setup.process) == 0
 
