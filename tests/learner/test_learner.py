@@ -489,6 +489,10 @@ def test_a_finished_policy_is_not_overwritten_by_another_network(
     assert (metrics.epoch, metrics.epochs_total) == (8, 8)
     assert not metrics.done, "the configuration asks for three versions"
     assert stop(setup.process) == 0
+    written = list(setup.folder.rglob("*"))
+    assert {"policies", "tutoring", "training.safetensors"} <= {path.name for path in written}
+    public = [path for path in written if path.stat().st_mode & 0o077]
+    assert not public, "what a run writes is for its user alone"
 
     checkpoint = setup.folder / "checkpoints" / "training.safetensors"
     before = checkpoint.read_bytes()
