@@ -115,25 +115,7 @@ class Renderer:
         if self._screen is not None and step != self._shown_step:
             self._show(self._screen, step)
         mujoco.mj_kinematics(self._model, self._data)
-        mujoco.mjv_updateScene(
-            self._model,
-            self._data,
-            self._options,
-            None,
-            self._unused_camera,
-            mujoco.mjtCatBit.mjCAT_ALL,
-            self._drawn,
-        )
-        rotation = np.empty(9)
-        for box, code in zip(self._boxes, self._box_codes, strict=True):
-            row = np.array([*box.pose.position_m, *box.pose.quaternion])
-            if box.name in poses.places:
-                row = poses.rows[poses.places[box.name]]
-            mujoco.mju_quat2Mat(rotation, row[3:])
-            geom = self._drawn.geoms[self._drawn.ngeom]
-            half = np.array(box.size_m) / 2
-            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_BOX, half, row[:3], rotation, code)
-            self._drawn.ngeom += 1
+        self._poses = poses
 
     def picture(self, eye: Array, width: int, height: int, focal: tuple[float, float]) -> Image:
         """Rendered picture (height, width, 4) uint8, as `actors.backends.eye` describes it.
@@ -145,11 +127,15 @@ class Renderer:
             focal: focal lengths in these pixels, across and down. MuJoCo draws with their mean: its
                 pixels are square. Those of a crop differ by half a percent, as its size is rounded.
         """
+        down = height / sum(focal)
+        if not self._shadows:  # what lies outside may cast a shadow into the picture
+            self._hide_bodies_outside(eye, down * width / height, down)
+        self._collect()
         for camera in self._drawn.camera:
             camera.pos, camera.forward, camera.up = eye[:3, 3], eye[:3, 0], eye[:3, 2]
             camera.frustum_near, camera.frustum_far = NEAR_M, FAR_M
             # Its width follows from the shape of the picture.
-            camera.frustum_top = NEAR_M * height / sum(focal)
+            camera.frustum_top = NEAR_M * down
             camera.frustum_bottom = -camera.frustum_top
         self._gl.make_current()
         if width > self._context.offWidth or height > self._context.offHeight:
@@ -175,6 +161,44 @@ class Renderer:
         """Free what the graphics driver holds, unless creating it has failed."""
         if getattr(self, "_context", None) is not None:
             self.close()
+
+    def _hide_bodies_outside(self, eye: Array, across: float, down: float) -> None:
+        """Leave out bodies whose bounding spheres lie outside the picture: every third triangle.
+
+        Args:
+            eye: pose (4, 4) of the camera.
+            across: tangent of half the angle of view.
+            down: the same from top to bottom.
+        """
+        radii = self._model.geom_rbound
+        forward, left, up = ((self._data.geom_xpos - eye[:3, 3]) @ eye[:3, :3]).T
+        inside = forward > -radii
+        for offset, tangent in ((left, across), (up, down)):
+            inside &= np.abs(offset) <= tangent * forward + radii * np.hypot(1, tangent)
+        self._model.geom_rgba[:, 3] = inside
+
+    def _collect(self) -> None:
+        """Tell MuJoCo's renderer what to draw."""
+        poses = self._poses
+        mujoco.mjv_updateScene(
+            self._model,
+            self._data,
+            self._options,
+            None,
+            self._unused_camera,
+            mujoco.mjtCatBit.mjCAT_ALL,
+            self._drawn,
+        )
+        rotation = np.empty(9)
+        for box, code in zip(self._boxes, self._box_codes, strict=True):
+            row = np.array([*box.pose.position_m, *box.pose.quaternion])
+            if box.name in poses.places:
+                row = poses.rows[poses.places[box.name]]
+            mujoco.mju_quat2Mat(rotation, row[3:])
+            geom = self._drawn.geoms[self._drawn.ngeom]
+            half = np.array(box.size_m) / 2
+            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_BOX, half, row[:3], rotation, code)
+            self._drawn.ngeom += 1
 
     def _show(self, screen: Screen, step: int) -> None:
         self._data.mocap_pos[-1] = screen.pose.position_m
