@@ -23,7 +23,8 @@ struct MixingProblem {
   std::int32_t values;         // of an action
   std::int32_t softmax_units;  // of each value
   const std::int64_t* members;  // (mixtures, parts) indices of sequences
-  const Real* weights;          // (mixtures, parts)
+  const Real* weights;          // (mixtures, parts) for V_S; parts of weight zero are not read
+  const Real* target_weights;   // (mixtures, parts) the same for the targets
   const Real* seen;             // (sequences, steps, inputs)
   const Real* targets;          // (sequences, steps, values)
   const Real* minima;           // (values)
@@ -35,22 +36,44 @@ struct MixingProblem {
   Real* code_entropies;         // (mixtures, steps)
 };
 
-// to[i] = sum over parts of weights[part] from[part][i]
+// The sequences of one mixture that count.
 template <typename Real>
-void mix(const Real* const* from, const Real* weights, int parts, std::ptrdiff_t count, Real* to) {
-  constexpr int kLanes = Simd<Real>::kLanes;
-  std::ptrdiff_t i = 0;
-  for (; i + kLanes <= count; i += kLanes) {
-    Vector<Real> sum = weights[0] * load(from[0] + i);
-    for (int part = 1; part < parts; ++part) sum += weights[part] * load(from[part] + i);
-    store(to + i, sum);
+class Parts {
+ public:
+  explicit Parts(int most) : from_(most), weights_(most) {}
+
+  // Takes those with a weight out of `all`, which holds `size` numbers for each sequence.
+  void choose(const Real* all, std::ptrdiff_t size, const std::int64_t* members,
+              const Real* weights) {
+    count_ = 0;
+    for (std::size_t part = 0; part < from_.size(); ++part) {
+      if (weights[part] == 0) continue;
+      from_[count_] = all + members[part] * size;
+      weights_[count_++] = weights[part];
+    }
   }
-  for (; i < count; ++i) {
-    Real sum = 0;
-    for (int part = 0; part < parts; ++part) sum += weights[part] * from[part][i];
-    to[i] = sum;
+
+  // to[i] = sum over the parts of weight * from[i]
+  void mix(std::ptrdiff_t size, Real* to) const {
+    constexpr int kLanes = Simd<Real>::kLanes;
+    std::ptrdiff_t i = 0;
+    for (; i + kLanes <= size; i += kLanes) {
+      Vector<Real> sum = {};
+      for (int part = 0; part < count_; ++part) sum += weights_[part] * load(from_[part] + i);
+      store(to + i, sum);
+    }
+    for (; i < size; ++i) {
+      Real sum = 0;
+      for (int part = 0; part < count_; ++part) sum += weights_[part] * from_[part][i];
+      to[i] = sum;
+    }
   }
-}
+
+ private:
+  std::vector<const Real*> from_;
+  std::vector<Real> weights_;
+  int count_ = 0;
+};
 
 template <typename Real>
 class Coding {
@@ -103,19 +126,16 @@ template <typename Real>
 void mix_all(const MixingProblem<Real>& problem) {
   const std::ptrdiff_t seen_size = std::ptrdiff_t(problem.steps) * problem.inputs;
   const std::ptrdiff_t target_size = std::ptrdiff_t(problem.steps) * problem.values;
-  std::vector<const Real*> seen_parts(problem.parts), target_parts(problem.parts);
   std::vector<Real> targets(target_size);
+  Parts<Real> parts(problem.parts);
   Coding<Real> coding(problem);
   for (int mixture = 0; mixture < problem.mixtures; ++mixture) {
-    const std::int64_t* members = problem.members + std::ptrdiff_t(mixture) * problem.parts;
-    const Real* weights = problem.weights + std::ptrdiff_t(mixture) * problem.parts;
-    for (int part = 0; part < problem.parts; ++part) {
-      seen_parts[part] = problem.seen + members[part] * seen_size;
-      target_parts[part] = problem.targets + members[part] * target_size;
-    }
-    mix(seen_parts.data(), weights, problem.parts, seen_size,
-        problem.mixed_seen + mixture * seen_size);
-    mix(target_parts.data(), weights, problem.parts, target_size, targets.data());
+    const std::ptrdiff_t first = std::ptrdiff_t(mixture) * problem.parts;
+    const std::int64_t* members = problem.members + first;
+    parts.choose(problem.seen, seen_size, members, problem.weights + first);
+    parts.mix(seen_size, problem.mixed_seen + mixture * seen_size);
+    parts.choose(problem.targets, target_size, members, problem.target_weights + first);
+    parts.mix(target_size, targets.data());
     for (int step = 0; step < problem.steps; ++step) {
       const std::ptrdiff_t place = std::ptrdiff_t(mixture) * problem.steps + step;
       problem.code_entropies[place] =

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
@@ -15,7 +16,7 @@ from learner.kernels.typed import TypedKernel
 
 _COUNTS: Final = ("mixtures", "parts", "steps", "inputs", "values", "softmax_units")
 _ARRAYS: Final = (
-    *("members", "weights", "seen", "targets"),
+    *("members", "weights", "target_weights", "seen", "targets"),
     *("minima", "maxima", "references", "widths"),
     *("mixed_seen", "codes", "code_entropies"),
 )
@@ -71,13 +72,19 @@ class MixedArrays:
 
 
 def mix(
-    members: Tensor, weights: Tensor, seen: Tensor, targets: Tensor, code: SoftmaxArrays
+    members: Tensor,
+    weights: Tensor,
+    target_weights: Tensor,
+    seen: Tensor,
+    targets: Tensor,
+    code: SoftmaxArrays,
 ) -> MixedArrays:
     """Mix sequences and code the mixed targets.
 
     Args:
         members: (B, parts) int64 indices of sequences.
-        weights: (B, parts) share of each part.
+        weights: (B, parts) weight of each part in V_S; what has none is not read.
+        target_weights: (B, parts) weight of each part in the actions.
         seen: (S, T, inputs) activity of V_S; its type is that of the results.
         targets: (S, T, values) actions.
         code: how actions are coded.
@@ -86,7 +93,7 @@ def mix(
         ValueError: the sizes do not fit together.
         IndexError: an index in `members` is outside 0..S - 1.
     """
-    _check(members, weights, seen, targets, code)
+    _check(members, (weights, target_weights), seen, targets, code)
     count, parts = members.shape
     _, steps, inputs = seen.shape
     values, softmax_units = code.references.shape
@@ -98,7 +105,7 @@ def mix(
     # named, so that these arrays live until the kernel has read them
     arrays = [
         members.contiguous(),
-        *(_like(seen, each) for each in (weights, seen, targets)),
+        *(_like(seen, each) for each in (weights, target_weights, seen, targets)),
         *(
             _like(seen, torch.from_numpy(each))
             for each in (code.minima, code.maxima, code.references, code.widths)
@@ -120,7 +127,11 @@ def _like(seen: Tensor, values: Tensor) -> Tensor:
 
 
 def _check(
-    members: Tensor, weights: Tensor, seen: Tensor, targets: Tensor, code: SoftmaxArrays
+    members: Tensor,
+    all_weights: Sequence[Tensor],
+    seen: Tensor,
+    targets: Tensor,
+    code: SoftmaxArrays,
 ) -> None:
     """The kernel follows sizes and indices without checking them."""
     values = len(code.references)
@@ -128,8 +139,9 @@ def _check(
         raise ValueError(
             f"members are {tuple(members.shape)} {members.dtype}, not (B, parts) int64"
         )
-    if weights.shape != members.shape:
-        raise ValueError(f"weights are {tuple(weights.shape)}, not {tuple(members.shape)}")
+    for weights in all_weights:
+        if weights.shape != members.shape:
+            raise ValueError(f"weights are {tuple(weights.shape)}, not {tuple(members.shape)}")
     if targets.shape != (*seen.shape[:2], values):
         raise ValueError(
             f"targets are {tuple(targets.shape)}, but seen is {tuple(seen.shape)} and the code has"

@@ -3,8 +3,9 @@
 Tutored situations are few and lie on a grid. A network that learns only these treats a situation
 between them as the nearest one. The tutor's behaviour has the same phases at the same steps in all
 situations, and both what is seen and what is done change almost linearly with the situation. So a
-weighted mean of the sequences at the corners of a grid cell, of V_S and of the targets alike, is
-close to what the tutor would show inside the cell (mixup, Zhang et al. 2018, within cells).
+weighted mean of the sequences at the corners of a grid cell is close to what the tutor would show
+inside the cell (mixup, Zhang et al. 2018, within cells). What is done changes so smoothly that a
+parabola through three tutored values is closer still; for V_S it is not.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Final, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from learner.kernels import mixing as kernel
 from learner.network.softmax_code import SoftmaxCode
@@ -31,22 +33,38 @@ Otherwise the outermost situations would lie at the edge of everything that is l
 the network learns for them would be pulled towards the middle of the grid.
 """
 
+LEAST_CLOSENESS: Final = -2.0
+LARGEST_CLOSENESS: Final = 2 / 3
+"""Limits of `_Cell.closeness`: a third point nearer to the cell than half its width is not used.
+
+Through points so close together a parabola would exaggerate small differences between sequences.
+"""
+
 
 @dataclass(frozen=True)
 class Mixtures:
     """B weighted means of sequences.
 
+    The members of each are the corners of a cell, then one sequence beyond it for each dimension.
+
     Attributes:
-        members: (B, corners of a cell) int64, indices of sequences.
-        weights: (B, corners of a cell); those of a mixture sum to one.
+        members: (B, corners + dimensions) int64, indices of sequences.
+        weights: (B, corners + dimensions) for V_S: linear in each dimension, so zero beyond the
+            cell; those of a mixture sum to one.
+        target_weights: (B, corners + dimensions) for the actions: parabolas; they sum to one, too.
     """
 
     members: Tensor
     weights: Tensor
+    target_weights: Tensor
 
-    def of(self, values: Tensor) -> Tensor:
-        """Mix values (S, ...) of all sequences; (B, ...)."""
-        return torch.einsum("bk,bk...->b...", self.weights.to(values.dtype), values[self.members])
+    def seen(self, values: Tensor) -> Tensor:
+        """Mix the activity of V_S (S, ...) of all sequences; (B, ...)."""
+        return _weighted(self.weights, values[self.members])
+
+    def targets(self, values: Tensor) -> Tensor:
+        """Mix the actions (S, ...) of all sequences; (B, ...)."""
+        return _weighted(self.target_weights, values[self.members])
 
 
 class NeighbourGrid:
@@ -77,20 +95,30 @@ class NeighbourGrid:
             {name: value for name, value in situation.items() if name not in distractors}
             for situation in situations
         ]
-        self._points = [
+        points = [
             _point(situation, length) for situation, length in zip(relevant, steps, strict=True)
         ]
         for index, situation in enumerate(situations):
             if not situation:  # not known: nothing can be said about its neighbours
-                self._points[index] = _Point((), (index,))
-        self._sequences_at: dict[_Point, list[int]] = defaultdict(list)
-        for index, point in enumerate(self._points):
-            self._sequences_at[point].append(index)
-        self._dimensions = max(len(point.values) for point in self._points)
-        neighbours = [
-            _neighbours(self._sequences_at, dimension) for dimension in range(self._dimensions)
-        ]
-        self._cells = {point: _cells_at(point, neighbours) for point in self._sequences_at}
+                points[index] = _Point((), (index,))
+        sequences_at: dict[_Point, list[int]] = defaultdict(list)
+        for index, point in enumerate(points):
+            sequences_at[point].append(index)
+        self._dimensions = max(len(point.values) for point in points)
+        neighbours = [_neighbours(sequences_at, each) for each in range(self._dimensions)]
+        numbers = {point: number for number, point in enumerate(sequences_at)}
+        cells = [_cells_at(point, neighbours) for point in sequences_at]
+        self._points = torch.tensor([numbers[point] for point in points])
+        self._cell_counts = torch.tensor(list(map(len, cells)))
+        self._first_cells = self._cell_counts.cumsum(0) - self._cell_counts
+        self._members_of_cells = torch.tensor(
+            [[numbers[point] for point in cell.points] for each in cells for cell in each]
+        )
+        self._closeness = torch.tensor([cell.closeness for each in cells for cell in each])
+        self._sequence_counts = torch.tensor(list(map(len, sequences_at.values())))
+        self._sequences_at = pad_sequence(
+            [torch.tensor(each) for each in sequences_at.values()], batch_first=True
+        )
 
     def mixtures(self, chosen: Tensor, share: float, generator: torch.Generator) -> Mixtures:
         """Draw a mixture for each of some sequences, at a random point of a cell around it.
@@ -98,37 +126,22 @@ class NeighbourGrid:
         Args:
             chosen: (B,) indices of the sequences.
             share: fraction of them that is mixed; the others keep weight one.
-            generator: draws which are mixed, the cells, the points, and the sequence at each corner
+            generator: draws which are mixed, the cells, the points, and the sequence of each member
                 where several share a situation.
         """
         count = len(chosen)
-        mixed, cells = torch.rand(2, count, generator=generator)
-        positions = torch.rand(self._dimensions, count, generator=generator)
-        positions = (positions * (1 + 2 * OVERSHOOT) - OVERSHOOT) * (mixed < share)
-        corners = product(*((1 - position, position) for position in positions))
-        weights = torch.stack([prod(factors, start=torch.ones(count)) for factors in corners], 1)
-        repeats = torch.rand(weights.shape, generator=generator)
-        members = [
-            self._members(*drawn)
-            for drawn in zip(chosen.tolist(), cells.tolist(), repeats.tolist(), strict=True)
-        ]
-        return Mixtures(torch.tensor(members), weights)
-
-    def _members(self, index: int, cell: float, repeats: Sequence[float]) -> list[int]:
-        """A sequence, then one for each other corner of one of its cells.
-
-        Args:
-            index: the sequence.
-            cell: 0..1, selects the cell.
-            repeats: 0..1 for each corner, selects one of the sequences there.
-        """
-        cells = self._cells[self._points[index]]
-        _, *others = cells[int(cell * len(cells))]
-        members = [index]
-        for corner, repeat in zip(others, repeats[1:], strict=True):
-            candidates = self._sequences_at[corner]
-            members.append(candidates[int(repeat * len(candidates))])
-        return members
+        mixed, drawn = torch.rand(2, count, generator=generator)
+        positions = torch.rand(count, self._dimensions, generator=generator)
+        positions = (positions * (1 + 2 * OVERSHOOT) - OVERSHOOT) * (mixed < share)[:, None]
+        points = self._points[chosen]
+        cells = self._first_cells[points] + _index(drawn, self._cell_counts[points])
+        corners = self._members_of_cells[cells]
+        repeats = torch.rand(corners.shape, generator=generator)
+        members = self._sequences_at[corners, _index(repeats, self._sequence_counts[corners])]
+        members[:, 0] = chosen
+        weights = _linear_weights(positions)
+        bends = _bends(positions, self._closeness[cells])
+        return Mixtures(members, weights, weights + bends)
 
 
 def mix_sequences(
@@ -144,10 +157,61 @@ def mix_sequences(
     """
     mask = sequences.mask[mixtures.members[:, 0]]
     if kernel.supports(sequences.seen):
-        mixed = kernel.mix(mixtures.members, mixtures.weights, sequences.seen, targets, code)
+        mixed = kernel.mix(
+            mixtures.members,
+            mixtures.weights,
+            mixtures.target_weights,
+            sequences.seen,
+            targets,
+            code,
+        )
         return Sequences(mixed.seen, mixed.codes, mask, mixed.code_entropies)
-    codes = code.encode(mixtures.of(targets).numpy())
-    return Sequences.of(mixtures.of(sequences.seen), torch.from_numpy(codes), mask)
+    codes = code.encode(mixtures.targets(targets).numpy())
+    return Sequences.of(mixtures.seen(sequences.seen), torch.from_numpy(codes), mask)
+
+
+def _weighted(weights: Tensor, values: Tensor) -> Tensor:
+    return torch.einsum("bk,bk...->b...", weights.to(values.dtype), values)
+
+
+def _index(drawn: Tensor, counts: Tensor) -> Tensor:
+    """Indices below `counts` for numbers that were drawn from 0 to 1."""
+    return (drawn.double() * counts).long()
+
+
+def _linear_weights(positions: Tensor) -> Tensor:
+    """(B, corners + D) weights of the corners of a cell at positions (B, D), 0 to 1 inside it."""
+    count, dimensions = positions.shape
+    corners = product(*((1 - position, position) for position in positions.T))
+    weights = [prod(factors, start=torch.ones(count)) for factors in corners]
+    return torch.stack(weights + [torch.zeros(count)] * dimensions, 1)
+
+
+def _bends(positions: Tensor, closeness: Tensor) -> Tensor:
+    """(B, corners + D) what makes parabolas of linear weights, for each dimension on its own.
+
+    A parabola through the values at 0, 1 and s differs from the line through those at 0 and 1 by
+    the second divided difference, times t (t - 1) at t.
+
+    Args:
+        positions: (B, D) t in each dimension.
+        closeness: (B, D) 1 / s; zero where there is no third value.
+    """
+    count, dimensions = positions.shape
+    bends = torch.zeros(count, 2**dimensions + dimensions)
+    steepness = positions * (positions - 1)
+    for dimension in range(dimensions):
+        close, here = closeness[:, dimension], steepness[:, dimension]
+        neighbour = _moved_in(dimension, dimensions)
+        bends[:, 0] += here * close
+        bends[:, neighbour] -= here * close / (1 - close)
+        bends[:, 2**dimensions + dimension] += here * close**2 / (1 - close)
+    return bends
+
+
+def _moved_in(dimension: int, dimensions: int) -> int:
+    """Index of the corner of a cell that differs from the first one in this dimension only."""
+    return int(2 ** (dimensions - 1 - dimension))
 
 
 class _Point(NamedTuple):
@@ -194,10 +258,23 @@ def _neighbours(points: Mapping[_Point, object], dimension: int) -> Mapping[_Poi
     return neighbours
 
 
-def _cells_at(
-    point: _Point, neighbours: Sequence[Mapping[_Point, list[_Point]]]
-) -> list[list[_Point]]:
-    """The corners of each cell at a point; the point is the first, the last dimension runs fastest.
+class _Cell(NamedTuple):
+    """A cell of the grid, as a point at one of its corners sees it.
+
+    Attributes:
+        points: the corners, the point itself first, the last dimension fastest; then for each
+            dimension a third point on the line through the point and its neighbour, beyond the
+            cell, or the point itself where there is none that helps.
+        closeness: for each dimension, 1 / s for a third point that is s times as far away as the
+            neighbour, in its direction; zero where there is none.
+    """
+
+    points: list[_Point]
+    closeness: list[float]
+
+
+def _cells_at(point: _Point, neighbours: Sequence[Mapping[_Point, list[_Point]]]) -> list[_Cell]:
+    """The cells at a point.
 
     A cell is flat in a dimension in which the point has no neighbour or a corner is missing.
     """
@@ -208,7 +285,28 @@ def _cells_at(
             for cell in cells
             for moved in _moved_cells(cell, neighbours[dimension], dimension)
         ]
-    return cells
+    return [_with_third_points(cell, neighbours) for cell in cells]
+
+
+def _with_third_points(
+    corners: list[_Point], neighbours: Sequence[Mapping[_Point, list[_Point]]]
+) -> _Cell:
+    point, dimensions = corners[0], len(neighbours)
+    third_points, closeness = [], []
+    for dimension, along in enumerate(neighbours):
+        neighbour = corners[_moved_in(dimension, dimensions)]
+        third, close = point, 0.0
+        if neighbour != point:
+            around = [*along[point], *along[neighbour]]
+            for each in (other for other in around if other not in (point, neighbour)):
+                start = point.values[dimension]
+                inverse = (neighbour.values[dimension] - start) / (each.values[dimension] - start)
+                if LEAST_CLOSENESS <= inverse <= LARGEST_CLOSENESS:
+                    third, close = each, inverse
+                    break
+        third_points.append(third)
+        closeness.append(close)
+    return _Cell(corners + third_points, closeness)
 
 
 def _moved_cells(

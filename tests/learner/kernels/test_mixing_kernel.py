@@ -33,9 +33,12 @@ def test_the_kernel_mixes_as_defined(
     targets = draw(5, 7, ACTION_SIZE, dtype=dtype)  # some are out of the code's ranges
     codes = torch.from_numpy(code.encode(targets.numpy())).to(dtype)
     sequences = Sequences.of(seen, codes, torch.ones(5, 7, dtype=dtype))
+    weights = draw(6, 4, dtype=dtype).softmax(1)
+    weights[1:4, 2:] = 0
     mixtures = Mixtures(
         torch.randint(5, (6, 4), generator=torch.Generator().manual_seed(3)),
-        draw(6, 4, dtype=dtype).softmax(1),
+        weights,
+        target_weights=draw(6, 4, dtype=dtype) / 2,  # some are negative
     )
     compiled = mix_sequences(mixtures, sequences, targets, code)
     monkeypatch.setattr(mixing, "supports", lambda _: False)
@@ -53,6 +56,7 @@ def test_the_kernel_mixes_as_defined(
         ({"members": torch.zeros(1, 2)}, "not .* int64"),
         ({"members": torch.zeros(0, 2, dtype=torch.int64)}, "not .* int64"),
         ({"weights": torch.ones(1, 3)}, "weights"),
+        ({"target_weights": torch.ones(1, 3)}, "weights"),
         ({"targets": torch.ones(5, 6, ACTION_SIZE)}, "targets"),
         ({"targets": torch.ones(5, 7, 3)}, "targets"),
     ],
@@ -63,6 +67,7 @@ def test_arrays_of_wrong_shape_are_refused(
     arrays = {
         "members": torch.tensor([[0, 4]]),
         "weights": torch.ones(1, 2),
+        "target_weights": torch.ones(1, 2),
         "seen": draw(5, 7, 21),
         "targets": draw(5, 7, ACTION_SIZE),
     }

@@ -18,8 +18,9 @@ def drawn(grid: NeighbourGrid, index: int, share: float = 1.0, draws: int = 400)
     return grid.mixtures(torch.full((draws,), index), share, generator)
 
 
-def corners(grid: NeighbourGrid, index: int) -> set[tuple[int, ...]]:
-    return {tuple(sorted(members)) for members in drawn(grid, index).members.tolist()}
+def corners(grid: NeighbourGrid, index: int, count: int = 4) -> set[tuple[int, ...]]:
+    members = drawn(grid, index).members[:, :count]
+    return {tuple(sorted(each)) for each in members.tolist()}
 
 
 def test_a_sequence_is_mixed_with_those_at_the_corners_of_a_cell_around_it() -> None:
@@ -35,12 +36,51 @@ def test_the_situation_of_a_mixture_follows_its_weights(seed: int, index: int) -
     grid = NeighbourGrid(GRID, [10] * 9)
     mixtures = grid.mixtures(torch.full((50,), index), 1.0, generator)
     assert torch.allclose(mixtures.weights.sum(1), torch.ones(50))
+    assert torch.allclose(mixtures.target_weights.sum(1), torch.ones(50), atol=1e-5)
     assert (mixtures.members[:, 0] == index).all()
     places = torch.tensor([[one["y"], one["yaw"]] for one in GRID])
-    where = mixtures.of(places)
+    where = mixtures.seen(places)
     near = (where - places[index]).abs()
     assert (near <= (1 + OVERSHOOT) * torch.tensor([0.0501, 45.01])).all()
     assert len({tuple(one) for one in where.tolist()}) > 40
+
+
+UNEVEN_Y_M, UNEVEN_YAWS = (0.2, 0.24, 0.3), (-45.0, -20.0, 10.0, 45.0)
+UNEVEN = [{"yaw": yaw, "y": y} for y, yaw in product(UNEVEN_Y_M, UNEVEN_YAWS)]
+PLACES = torch.tensor([[one["y"], one["yaw"]] for one in UNEVEN], dtype=torch.float64)
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    index=st.integers(0, len(UNEVEN) - 1),
+    coefficients=st.lists(st.floats(-1, 1), min_size=5, max_size=5),
+)
+def test_actions_that_bend_with_the_situation_are_mixed_without_error(
+    seed: int, index: int, coefficients: list[float]
+) -> None:
+    def bent(places: torch.Tensor) -> torch.Tensor:
+        y, yaw = 10 * places[:, 0], places[:, 1] / 45
+        terms = torch.stack([y, yaw, y**2, yaw**2, y * yaw], 1)
+        return terms @ torch.tensor(coefficients, dtype=torch.float64)
+
+    grid = NeighbourGrid(UNEVEN, [10] * len(UNEVEN))
+    generator = torch.Generator().manual_seed(seed)
+    mixtures = grid.mixtures(torch.full((50,), index), 1.0, generator)
+    expected = bent(mixtures.seen(PLACES))
+    assert torch.allclose(mixtures.targets(bent(PLACES)), expected, atol=1e-4)
+
+
+def test_what_is_seen_is_mixed_without_sequences_beyond_the_cell() -> None:
+    mixtures = drawn(NeighbourGrid(GRID, [10] * 9), 4)
+    assert mixtures.weights[:, 4:].eq(0).all()
+    assert mixtures.target_weights[:, 4:].ne(0).any()
+
+
+def test_where_a_third_value_is_missing_or_too_close_actions_are_mixed_linearly() -> None:
+    for values in ((0.2, 0.25), (0.2, 0.25, 0.26)):
+        grid = NeighbourGrid([{"y": y} for y in values], [10] * len(values))
+        mixtures = drawn(grid, 0)
+        assert torch.equal(mixtures.weights, mixtures.target_weights)
 
 
 def test_every_repeat_of_a_corner_is_drawn() -> None:
@@ -103,7 +143,7 @@ def test_only_sequences_with_the_same_discrete_values_and_length_are_mixed(
     grid = NeighbourGrid(situations, steps)
     generator = torch.Generator().manual_seed(seed)
     mixtures = grid.mixtures(torch.arange(count), 1.0, generator)
-    assert mixtures.members.shape == (count, 4), "corners along the two continuous values"
+    assert mixtures.members.shape == (count, 4 + 2), "corners along the two continuous values"
     for index, members in enumerate(mixtures.members.tolist()):
         assert members[0] == index
         for member in members:
@@ -164,7 +204,7 @@ def test_situations_that_differ_in_distractors_alone_lie_at_the_same_point() -> 
     chosen, generator = torch.arange(3).repeat(50), torch.Generator().manual_seed(1)
     grid = NeighbourGrid(situations, [5, 5, 5], {"other_m", "take"})
     mixtures = grid.mixtures(chosen, 1.0, generator)
-    partners = {(int(a), int(b)) for a, b in mixtures.members}
+    partners = {(int(a), int(b)) for a, b, _ in mixtures.members}
     assert partners == {(0, 1), (1, 0), (1, 2), (2, 1)}
     alone = NeighbourGrid(situations, [5, 5, 5]).mixtures(chosen, 1.0, generator)
     assert all(len(set(members.tolist())) == 1 for members in alone.members)
