@@ -291,22 +291,30 @@ def _cells_at(point: _Point, neighbours: Sequence[Mapping[_Point, list[_Point]]]
 def _with_third_points(
     corners: list[_Point], neighbours: Sequence[Mapping[_Point, list[_Point]]]
 ) -> _Cell:
-    point, dimensions = corners[0], len(neighbours)
     third_points, closeness = [], []
     for dimension, along in enumerate(neighbours):
-        neighbour = corners[_moved_in(dimension, dimensions)]
-        third, close = point, 0.0
-        if neighbour != point:
-            around = [*along[point], *along[neighbour]]
-            for each in (other for other in around if other not in (point, neighbour)):
-                start = point.values[dimension]
-                inverse = (neighbour.values[dimension] - start) / (each.values[dimension] - start)
-                if LEAST_CLOSENESS <= inverse <= LARGEST_CLOSENESS:
-                    third, close = each, inverse
-                    break
+        moved = corners[_moved_in(dimension, len(neighbours))]
+        third, close = _third_point(corners[0], moved, along, dimension)
         third_points.append(third)
         closeness.append(close)
     return _Cell(corners + third_points, closeness)
+
+
+def _third_point(
+    point: _Point, moved: _Point, along: Mapping[_Point, list[_Point]], dimension: int
+) -> tuple[_Point, float]:
+    """A third point beside a point and its neighbour along a dimension, and its closeness.
+
+    Without a neighbour, or a third point that helps: the point itself, and zero.
+    """
+    if moved != point:
+        start = point.values[dimension]
+        for third in (*along[point], *along[moved]):
+            if third not in (point, moved):
+                close = (moved.values[dimension] - start) / (third.values[dimension] - start)
+                if LEAST_CLOSENESS <= close <= LARGEST_CLOSENESS:
+                    return third, close
+    return point, 0.0
 
 
 def _moved_cells(
