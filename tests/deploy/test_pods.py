@@ -13,7 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -69,53 +69,52 @@ class Pods:
         self._endpoint = endpoint
         self.manifests = folder / "manifests"
 
-    def start(self, component: str, number: int = 0) -> None:
+    def start(self, component: str) -> None:
         """Start a pod as its manifest says; it is stopped when the test ends."""
-        name = f"{component}-{number}"
-        for part in ("space", "data"):
-            (self._folder / name / part).mkdir(parents=True)
-        os.chown(self._folder / name / "data", USER, 0)
-        self._stack.enter_context(self._running(self._command(component, name), self.log(name)))
+        command = (*self._container(component), *self._command(component))
+        self._stack.enter_context(self._running(command, self.log(component)))
 
-    def log(self, name: str) -> Path:
-        return self._folder / f"{name}.log"
+    def log(self, component: str) -> Path:
+        return self._folder / f"{component}.log"
 
     def data(self, component: str) -> Path:
-        return self._folder / f"{component}-0" / "data"
+        return self._folder / component / "data"
 
     def say(self, script: str) -> str:
         """What a shell script says in a container of its own."""
-        for part in ("space", "data"):
-            (self._folder / "shell" / part).mkdir(parents=True)
         command = (*self._container("shell"), "sh", "-c", script)
         done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60)
         return done.stdout
 
-    def _command(self, component: str, name: str) -> list[str | Path]:
+    def _command(self, component: str) -> list[str]:
+        """What the container of a manifest runs, with its environment variables."""
         documents = yaml.safe_load_all((self.manifests / f"{component}.yaml").read_text())
         [container] = [found for each in documents for found in containers(each)]
         assert container["securityContext"]["readOnlyRootFilesystem"]
         places = {mount["mountPath"] for mount in container["volumeMounts"]}
         assert places <= {"/etc/vmdnn", "/certificates", "/tmp", "/data"}
         variables = {each["name"]: each.get("value", "") for each in container["env"]}
-        variables |= {"HUB": self._endpoint, "POD": name} | image_variables()
+        variables |= {"HUB": self._endpoint, "POD": f"{component}-0"} | image_variables()
         words = [
             re.sub(r"\$\((\w+)\)", lambda found: variables[found[1]], word)
             for word in container["command"]
         ]
         told = (f"{key}={value}" for key, value in variables.items())
-        return [*self._container(name), "env", "-i", "-C", "/data", *told, *words]
+        return ["env", "-i", "-C", "/data", *told, *words]
 
     def _container(self, name: str) -> list[str | Path]:
-        """What runs the words that follow in a container."""
+        """Make the folders of a container; return what runs the words that follow in it."""
         place = self._folder / name
+        for part in ("space", "data"):
+            (place / part).mkdir(parents=True)
+        os.chown(place / "data", USER, 0)
         return [
             *("unshare", "--mount", "--propagation", "private", "sh", "-c", CONTAINER, "container"),
             *(place / "space", place / "data", self.manifests, sys.executable),
         ]
 
     @contextmanager
-    def _running(self, command: list[str | Path], log: Path) -> Iterator[None]:
+    def _running(self, command: Sequence[str | Path], log: Path) -> Iterator[None]:
         with log.open("wb") as stream:
             process = subprocess.Popen(list(map(str, command)), stdout=stream, stderr=stream)
         try:
@@ -158,15 +157,14 @@ def test_the_containers_are_as_narrow_as_the_manifests_say(tmp_path: Path) -> No
 
 
 def test_a_run_needs_no_more_than_the_manifests_give(tmp_path: Path) -> None:
-    endpoint = free_endpoint()
     with ExitStack() as stack:
-        pods = Pods(stack, tmp_path, endpoint)
+        pods = Pods(stack, tmp_path, free_endpoint())
         smoke = ROOT / "deploy/config/smoke.yaml"
         out = ("--out", str(pods.manifests), "--actors", "1")
         assert main(["kubernetes", *out, "--config", str(smoke)]) == 0
         for component in (*SERVICES, "actor"):
             pods.start(component)
-        learner = pods.log("learner-0")
+        learner = pods.log("learner")
         eventually(lambda: "policy 4 is published" in learner.read_text(), "the end", PATIENCE_S)
         [run] = pods.data("evaluator").iterdir()
         trials = run / "evaluation" / "trials.jsonl"
@@ -174,4 +172,4 @@ def test_a_run_needs_no_more_than_the_manifests_give(tmp_path: Path) -> None:
         recordings = pods.data("recorder")
         eventually(lambda: any(recordings.rglob("*.mcap")), "a recording", PATIENCE_S)
     for component in (*SERVICES, "actor"):
-        assert "Read-only" not in pods.log(f"{component}-0").read_text()
+        assert "Read-only" not in pods.log(component).read_text()
