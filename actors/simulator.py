@@ -256,7 +256,9 @@ class StepReport:
     """What happened during one control step, collected from all of its physics steps.
 
     Attributes:
-        touches: (watched box, toucher) pairs; toucher is ROBOT or the name of a moving box.
+        touches: (watched box, toucher) pairs of bodies that overlap, or that are so near and so
+            fast that they would overlap within a physics step; toucher is ROBOT or the name of a
+            moving box.
     """
 
     touches: frozenset[tuple[str, str]]

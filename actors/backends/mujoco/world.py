@@ -34,6 +34,8 @@ CONTACT_DIMENSIONS: Final = 3
 """A normal force and friction in two directions; no friction against spinning and rolling."""
 LEAST_FRICTION: Final = 1e-5
 """MuJoCo's own lower limit."""
+TOUCH_MARGIN_M: Final = 0.004
+"""Bodies nearer than this to a watched box are looked at: will they overlap in a physics step?"""
 
 _NO_TOUCH: Final = -1
 """Number of two bodies whose touch is not reported."""
@@ -164,13 +166,40 @@ class World:
         mujoco.mj_step1(self._model, self._data)
 
     def touches(self) -> Iterator[tuple[str, str]]:
-        """(watched box, toucher) pairs of bodies that overlap now."""
-        if self._touches and self._data.ncon:
-            geoms = self._data.contact.geom
-            for pairs in (geoms, geoms[:, ::-1]):
-                for number in self._touch_numbers[pairs[:, 0], pairs[:, 1]].tolist():
-                    if number != _NO_TOUCH:
-                        yield self._touches[number]
+        """(watched box, toucher) pairs of bodies that overlap, or will within a physics step.
+
+        A grazing hand may approach and leave again within one step. Engines that look ahead, such
+        as PhysX, push it away in that step, and so it counts as a touch here, too.
+        """
+        if not self._touches or not self._data.ncon:
+            return
+        geoms = self._data.contact.geom
+        for pairs in (geoms, geoms[:, ::-1]):
+            numbers = self._touch_numbers[pairs[:, 0], pairs[:, 1]]
+            for place in np.flatnonzero(numbers != _NO_TOUCH).tolist():
+                if self._overlaps_soon(self._data.contact[place]):
+                    yield self._touches[numbers[place]]
+
+    def _overlaps_soon(self, contact: Any) -> bool:
+        if contact.dist < 0.0:
+            return True
+        one, other = (
+            self._velocity(self._model.geom_bodyid[geom], contact.pos) for geom in contact.geom
+        )
+        normal = contact.frame[:3]  # from the first geom to the second
+        approach_mps = float(normal @ (one - other))
+        return bool(contact.dist < approach_mps * self._model.opt.timestep)
+
+    def _velocity(self, body: int, point_m: Array) -> Array:
+        """Velocity (3,) in m/s of a point of a body, both in world coordinates."""
+        turn_and_move = np.zeros(6)
+        mujoco.mj_objectVelocity(
+            self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, body, turn_and_move, 0
+        )
+        velocity: Array = turn_and_move[3:] + np.cross(
+            turn_and_move[:3], point_m - self._data.xpos[body]
+        )
+        return velocity
 
     def joints_rad(self) -> Array:
         """Measured joint angles (J,)."""
@@ -217,18 +246,28 @@ def _add_contacts(spec: Any, skin: list[str], boxes: tuple[Box, ...]) -> None:
     MuJoCo by itself takes the greater of two frictions; a pair has a friction of its own.
     """
     for geom, box in product(skin, boxes):
-        _add_contact(spec, geom, box.name, (robot.SKIN_FRICTION + box.friction) / 2)
+        pair = _add_contact(spec, geom, box.name, (robot.SKIN_FRICTION + box.friction) / 2)
+        if box.watched:
+            _look_ahead(pair)
     for one, other in combinations(boxes, 2):
         if one.mass_kg is not None or other.mass_kg is not None:
-            _add_contact(spec, one.name, other.name, (one.friction + other.friction) / 2)
+            pair = _add_contact(spec, one.name, other.name, (one.friction + other.friction) / 2)
+            if one.watched or other.watched:
+                _look_ahead(pair)
 
 
-def _add_contact(spec: Any, one: str, other: str, friction: float) -> None:
+def _look_ahead(pair: Any) -> None:
+    """Report a contact from a distance on; a force acts from the overlap on, as without this."""
+    pair.gap = TOUCH_MARGIN_M
+
+
+def _add_contact(spec: Any, one: str, other: str, friction: float) -> Any:
     pair = spec.add_pair(geomname1=one, geomname2=other)
     pair.condim = CONTACT_DIMENSIONS
     pair.friction[:2] = max(friction, LEAST_FRICTION)
     pair.solref = [CONTACT_TIME_CONSTANT_S, CONTACT_DAMPING_RATIO]
     pair.solimp = CONTACT_IMPEDANCE
+    return pair
 
 
 def _touches_of(
