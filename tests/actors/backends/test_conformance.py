@@ -206,16 +206,6 @@ def test_a_near_body_is_not_reported_as_touching(blind):
     assert not any(blind.step(targets()).touches for _ in range(5))
 
 
-def test_a_body_that_passes_near_by_is_not_reported_as_touching(blind):
-    """A box falls past a watched one, one millimetre from its side."""
-    ledge = Box("ledge", (0.1, 0.1, 0.02), Pose((0.3, 0.3, 0.5)), (1, 1, 1), watched=True)
-    beside = Pose((0.371, 0.3, 0.56))
-    falling = Box("falling", (0.04, 0.04, 0.04), beside, (1, 1, 1), mass_kg=0.1)
-    blind.reset(scene(ledge, falling))
-    assert not any(blind.step(targets()).touches for _ in range(8))
-    assert blind.bodies()["falling"].position_m[2] < 0.2
-
-
 def test_touches_of_unwatched_bodies_are_not_reported(blind):
     blind.reset(scene())
     assert blind.step(targets()).touches == frozenset()  # though the object stands on the table
