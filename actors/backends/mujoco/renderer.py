@@ -144,8 +144,10 @@ class Renderer:
         mujoco.mjr_render(view, self._drawn, self._context)
         codes = np.empty((height, width, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(codes, None, view, self._context)
-        codes = codes[::-1]
-        return self._table[codes[..., 0], codes[..., 1]].view(np.uint8).reshape(height, width, 4)
+        places = codes[::-1, :, 0].astype(np.intp)  # in the flat table, row by row of red
+        places *= 256
+        places += codes[::-1, :, 1]
+        return self._table.take(places).view(np.uint8).reshape(height, width, 4)
 
     def close(self) -> None:
         """Free what the graphics driver holds."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from actors.backends import eye
 from actors.backends.base import BaseSimulator
@@ -67,7 +67,9 @@ class MujocoSimulator(BaseSimulator[World, Renderer]):
 
 
 def _matrix(pose: Pose) -> Array:
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, np.array(pose.quaternion))
     matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(pose.quaternion, scalar_first=True).as_matrix()
+    matrix[:3, :3] = rotation.reshape(3, 3)
     matrix[:3, 3] = pose.position_m
     return matrix
