@@ -12,19 +12,19 @@ from proto.keys import Role
 from services.arguments.process import HEARTBEAT_FILE
 
 FILE: Final = "compose.yaml"
+CONFIG_FILE: Final = "compose-config.yaml"
+"""The configuration, beside it: Podman's Compose does not know `configs`."""
 
 
 def compose_files(plan: Plan) -> dict[str, str]:
     """Return the files by name."""
     started = programs(plan.config, Path(CONFIG), plan.actors, vmdnn="vmdnn")
-    content = plan.config_text.replace("$", "$$")
     composed = {
         "name": f"vmdnn-{plan.config.run.name.lower()}",
         "services": {program.name: _service(program, plan) for program in started},
         "volumes": {_volume(program): {} for program in started if _volume(program)},
-        "configs": {"vmdnn": {"content": content}},
     }
-    return {FILE: yaml_text("compose", [composed])}
+    return {FILE: yaml_text("compose", [composed]), CONFIG_FILE: plan.config_text}
 
 
 def _volume(program: Program) -> str:
@@ -46,7 +46,7 @@ def _service(program: Program, plan: Plan) -> dict[str, Any]:
             *plan.admission,
         ],
         "environment": {"OMP_NUM_THREADS": str(program.threads), HEARTBEAT_FILE: HEARTBEAT},
-        "configs": [{"source": "vmdnn", "target": CONFIG}],
+        "volumes": [f"./{CONFIG_FILE}:{CONFIG}:ro"],
         "read_only": True,
         "tmpfs": ["/tmp:mode=1777"],
         "cap_drop": ["ALL"],
@@ -62,10 +62,11 @@ def _service(program: Program, plan: Plan) -> dict[str, Any]:
         },
     }
     if volume := _volume(program):
-        service["volumes"] = [f"{volume}:{DATA}"]
+        service["volumes"] += [f"{volume}:{DATA}"]
         service["depends_on"] = ["hub"]
     else:
         service["build"] = {"context": "..", "dockerfile": "deploy/container/Dockerfile"}
     if program.processes > 1:
-        service["deploy"] = {"replicas": program.processes}
+        # Podman's Compose starts one only, unless it is told the mode, too.
+        service["deploy"] = {"mode": "replicated", "replicas": program.processes}
     return service
