@@ -20,11 +20,11 @@ LOG = logging.getLogger(__name__)
 mujoco.set_mju_user_warning(LOG.warning)
 
 # How bodies touch. A grasp must hold for seconds by friction alone: with a pyramidal cone, or
-# without the passes against slip, the object creeps out of the hand.
+# without the passes against slip, the object creeps out of the hand; with 3, by 1.5 mm in 10 s.
 SOLVER_ITERATIONS: Final = 100
 SOLVER_TOLERANCE: Final = 1e-8
 FRICTIONAL_TO_NORMAL_IMPEDANCE: Final = 10.0
-NOSLIP_ITERATIONS: Final = 3
+NOSLIP_ITERATIONS: Final = 10
 CONTACT_TIME_CONSTANT_S: Final = 0.01
 """Time in which an overlap of two bodies decays; at least two physics steps."""
 CONTACT_DAMPING_RATIO: Final = 1.0
