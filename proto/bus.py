@@ -104,8 +104,8 @@ class Attachment:
         return decode(Wire(encoding, content.to_bytes()), cls)
 
     def written(self) -> bytes:
-        """Encode it. It is made of what is valid, so it is not checked here."""
-        return encode(self, check=False).payload
+        """Encode it: as `encode` does, but several times as fast. Each message has one."""
+        return f'{{"sender": {json.dumps(self.sender)}, "sha256": "{self.sha256}"}}'.encode()
 
     def check(self, payload: bytes) -> None:
         """Compare a payload with the digest; raises MessageError if they differ."""

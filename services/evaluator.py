@@ -55,6 +55,8 @@ WAITING: Final = 64
 """The same for reports of failed simulations."""
 AT_ONCE: Final = 256
 """Trials that are written to disk together."""
+TOLD_SINGLY: Final = 16
+"""Of more trials that are counted together the log tells the success rate only."""
 IDLE_S: Final = 0.5
 """How often to look whether it should stop, while no outcome arrives."""
 VERSIONS_TOLD: Final = 500
@@ -347,8 +349,7 @@ class Evaluator:
             pass
         taken, self._taken = self._taken, []
         trials = [played for played in taken if played.kind is Kind.TRIAL]
-        for played in when_disk_allows(self._lifecycle, lambda: self._log.add_outcomes(trials)):
-            _report_trial(played, outcome_words(played.outcome.reason))
+        _report(when_disk_allows(self._lifecycle, lambda: self._log.add_outcomes(trials)))
         for played in trials:
             policy = (played.training, played.policy_version)
             self._leases.finish((policy, played.suite, played.seed))
@@ -488,10 +489,28 @@ def _versions_words(versions: list[int]) -> str:
     return f"policy {words}" if len(versions) == 1 else f"the policies {words}"
 
 
+def _report(trials: list[EpisodeOutcome]) -> None:
+    """Log what has been counted: each trial, or how many of each policy if there are many."""
+    if len(trials) <= TOLD_SINGLY:
+        for played in trials:
+            _report_trial(played, outcome_words(played.outcome.reason))
+        return
+    groups: dict[tuple[int, str], list[Outcome]] = {}
+    for played in trials:
+        groups.setdefault((played.policy_version, _suite_words(played)), []).append(played.outcome)
+    for (version, suite), outcomes in groups.items():
+        strict = sum(outcome.strict for outcome in outcomes)
+        LOG.info("policy %d, %d %strials: %d strict", version, len(outcomes), suite, strict)
+
+
 def _report_trial(played: EpisodeOutcome | EpisodeFailed, result: str) -> None:
-    suite = "" if played.conditions is None else f"{played.suite} "
-    version = played.policy_version
+    suite, version = _suite_words(played), played.policy_version
     LOG.info("policy %d, %strial %d: %s", version, suite, played.seed, plain(result))
+
+
+def _suite_words(played: EpisodeOutcome | EpisodeFailed) -> str:
+    """The suite of a trial, unless it is the usual one, before a noun."""
+    return "" if played.conditions is None else f"{played.suite} "
 
 
 def _can_be_disturbed(backend: str, ability: Ability | None, player: Player) -> bool:

@@ -16,7 +16,7 @@ import zenoh
 from ports import free_endpoint
 from processes import eventually, listening_hub, run_vmdnn, stop
 
-from proto.bus import LARGEST_MESSAGE, Bus, open_bus, open_hub
+from proto.bus import LARGEST_MESSAGE, Attachment, Bus, open_bus, open_hub
 from proto.codec import encode
 from proto.config import HubConfig
 from proto.errors import UserError
@@ -144,6 +144,12 @@ def test_an_invalid_message_is_counted_and_logged_once_and_dropped(
     assert len(logged) == 2
     assert sum("learner/honest" in line for line in logged) == 1
     assert all("encoding: expected application/msgpack;vmdnn.receipt.2" in line for line in logged)
+
+
+def test_an_attachment_is_written_as_every_message_is() -> None:
+    attachment = Attachment.of(b"payload", 'actor/"x"\\')
+    assert attachment.written() == encode(attachment, check=False).payload
+    assert Attachment.read(zenoh.ZBytes(attachment.written())) == attachment
 
 
 def test_a_corrupted_payload_is_refused(shared: Network) -> None:

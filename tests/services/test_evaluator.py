@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -34,7 +35,7 @@ from proto.messages import (
 )
 from proto.metrics import EvaluatorMetrics, Stage
 from proto.suites import Conditions, Player
-from services.evaluator import _reasons
+from services.evaluator import _reasons, _report
 from services.trials.success import Tally
 
 TASK = task_called("experiment1")
@@ -326,6 +327,27 @@ def test_nothing_counts_that_was_not_asked_for(setup: EvaluatorSetup) -> None:
     metrics = setup.wait_for_metrics(lambda metrics: counts(metrics) == {1: 3})
     assert metrics.policies[0].reasons == {"reason_0": 1, "reason_1": 1}
     assert metrics.refused >= 9, "messages are sent until they are answered"
+
+
+def test_many_trials_that_come_together_take_one_line_of_the_log_for_each_policy(
+    make_episode: MakeEpisode, caplog: pytest.LogCaptureFixture
+) -> None:
+    fields = fitting_fields() | {"kind": Kind.TRIAL, "training": "training"}
+    steps = len(fields["phases"])
+    played = []
+    for seed in range(20):
+        fields["outcome"] = NOT_LIFTED if seed < 3 else PRECISE
+        episode = make_episode(steps, seed=seed, policy_version=1 + seed % 2, **fields)
+        played.append(EpisodeOutcome.of(episode))
+    with caplog.at_level(logging.INFO):
+        _report(played[:2])
+        _report(played)
+    assert [record.message for record in caplog.records] == [
+        "policy 1, trial 0: not lifted",
+        "policy 2, trial 1: not lifted",
+        "policy 1, 10 trials: 8 strict",
+        "policy 2, 10 trials: 9 strict",
+    ]
 
 
 def test_many_reasons_fit_into_the_metrics() -> None:
