@@ -13,11 +13,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise, product
-from math import prod
+from itertools import pairwise
 from typing import Final, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -139,9 +140,9 @@ class NeighbourGrid:
         repeats = torch.rand(corners.shape, generator=generator)
         members = self._sequences_at[corners, _index(repeats, self._sequence_counts[corners])]
         members[:, 0] = chosen
-        weights = _linear_weights(positions)
-        bends = _bends(positions, self._closeness[cells])
-        return Mixtures(members, weights, weights + bends)
+        weights = _linear_weights(positions.numpy())
+        bends = _bends(positions.numpy(), self._closeness[cells].numpy())
+        return Mixtures(members, torch.from_numpy(weights), torch.from_numpy(weights + bends))
 
 
 def mix_sequences(
@@ -179,15 +180,22 @@ def _index(drawn: Tensor, counts: Tensor) -> Tensor:
     return (drawn.double() * counts).long()
 
 
-def _linear_weights(positions: Tensor) -> Tensor:
+# Numpy, because PyTorch takes several times as long for arrays as small as these.
+
+
+def _linear_weights(positions: NDArray[np.float32]) -> NDArray[np.float32]:
     """(B, corners + D) weights of the corners of a cell at positions (B, D), 0 to 1 inside it."""
     count, dimensions = positions.shape
-    corners = product(*((1 - position, position) for position in positions.T))
-    weights = [prod(factors, start=torch.ones(count)) for factors in corners]
-    return torch.stack(weights + [torch.zeros(count)] * dimensions, 1)
+    weights = np.zeros((count, 2**dimensions + dimensions), dtype=np.float32)
+    corners = np.ones((count, 1), dtype=np.float32)
+    for position in positions.T[..., None]:  # the last dimension is the fastest
+        corners = np.stack([corners * (1 - position), corners * position], axis=2)
+        corners = corners.reshape(count, -1)
+    weights[:, : 2**dimensions] = corners
+    return weights
 
 
-def _bends(positions: Tensor, closeness: Tensor) -> Tensor:
+def _bends(positions: NDArray[np.float32], closeness: NDArray[np.float32]) -> NDArray[np.float32]:
     """(B, corners + D) what makes parabolas of linear weights, for each dimension on its own.
 
     A parabola through the values at 0, 1 and s differs from the line through those at 0 and 1 by
@@ -198,14 +206,14 @@ def _bends(positions: Tensor, closeness: Tensor) -> Tensor:
         closeness: (B, D) 1 / s; zero where there is no third value.
     """
     count, dimensions = positions.shape
-    bends = torch.zeros(count, 2**dimensions + dimensions)
-    steepness = positions * (positions - 1)
+    bends = np.zeros((count, 2**dimensions + dimensions), dtype=np.float32)
+    at_point = positions * (positions - 1) * closeness
+    at_neighbour = at_point / (1 - closeness)
+    at_third = at_neighbour * closeness
+    bends[:, 0] = at_point.sum(1)
+    bends[:, 2**dimensions :] = at_third
     for dimension in range(dimensions):
-        close, here = closeness[:, dimension], steepness[:, dimension]
-        neighbour = _moved_in(dimension, dimensions)
-        bends[:, 0] += here * close
-        bends[:, neighbour] -= here * close / (1 - close)
-        bends[:, 2**dimensions + dimension] += here * close**2 / (1 - close)
+        bends[:, _moved_in(dimension, dimensions)] = -at_neighbour[:, dimension]
     return bends
 
 
