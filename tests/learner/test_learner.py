@@ -59,6 +59,8 @@ SETTINGS = {
     "learner.checkpoint_every_epochs": 7,
     "done.policy_versions": 3,
 }
+LONG = ("--set", "learner.epochs=1000000")
+"""A training that has not finished when it is killed."""
 
 
 FAILED = NOT_LIFTED
@@ -332,7 +334,7 @@ def test_pretraining_has_its_own_cases_and_does_not_wait_for_the_others(
 
 
 def test_a_killed_learner_publishes_its_policy_again_and_continues(setup: LearnerSetup) -> None:
-    setup.start()
+    setup.start(*LONG)
     setup.show_all()
     eventually(lambda: len(setup.policies) >= 3, "three policies")
     setup.process.kill()
@@ -349,7 +351,7 @@ def test_a_killed_learner_publishes_its_policy_again_and_continues(setup: Learne
     assert known in {before[-1].version, before[-1].version + 1}
 
     setup.policies.clear()
-    setup.start()
+    setup.start(*LONG)
     eventually(lambda: len(setup.policies) >= 3, "policies after the restart")
     again = setup.policies[0]
     assert again.version == known
@@ -510,7 +512,7 @@ def test_a_wrong_case_is_refused_at_the_start(setup: LearnerSetup) -> None:
 
 
 def test_damaged_checkpoint_policy_and_run_id_lose_no_version(setup: LearnerSetup) -> None:
-    setup.start()
+    setup.start(*LONG)
     setup.show_all()
     eventually(lambda: len(setup.policies) >= 3, "three policies")
     setup.process.kill()
@@ -529,7 +531,7 @@ def test_damaged_checkpoint_policy_and_run_id_lose_no_version(setup: LearnerSetu
     half.touch()
 
     setup.policies.clear()
-    setup.start()
+    setup.start(*LONG)
     eventually(lambda: len(setup.policies) >= 2, "policies after the restart")
     first, second = (policy.version for policy in setup.policies[:2])
     assert first < int(newest.stem) < second
