@@ -140,6 +140,7 @@ class NeighbourGrid:
         repeats = torch.rand(corners.shape, generator=generator)
         members = self._sequences_at[corners, _index(repeats, self._sequence_counts[corners])]
         members[:, 0] = chosen
+        # Numpy: PyTorch takes several times as long for arrays as small as these.
         weights = _linear_weights(positions.numpy())
         bends = _bends(positions.numpy(), self._closeness[cells].numpy())
         return Mixtures(members, torch.from_numpy(weights), torch.from_numpy(weights + bends))
@@ -178,9 +179,6 @@ def _weighted(weights: Tensor, values: Tensor) -> Tensor:
 def _index(drawn: Tensor, counts: Tensor) -> Tensor:
     """Indices below `counts` for numbers that were drawn from 0 to 1."""
     return (drawn.double() * counts).long()
-
-
-# Numpy, because PyTorch takes several times as long for arrays as small as these.
 
 
 def _linear_weights(positions: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -246,28 +246,23 @@ def _add_contacts(spec: Any, skin: list[str], boxes: tuple[Box, ...]) -> None:
     MuJoCo by itself takes the greater of two frictions; a pair has a friction of its own.
     """
     for geom, box in product(skin, boxes):
-        pair = _add_contact(spec, geom, box.name, (robot.SKIN_FRICTION + box.friction) / 2)
-        if box.watched:
-            _look_ahead(pair)
+        friction = (robot.SKIN_FRICTION + box.friction) / 2
+        _add_contact(spec, geom, box.name, friction, watched=box.watched)
     for one, other in combinations(boxes, 2):
         if one.mass_kg is not None or other.mass_kg is not None:
-            pair = _add_contact(spec, one.name, other.name, (one.friction + other.friction) / 2)
-            if one.watched or other.watched:
-                _look_ahead(pair)
+            friction = (one.friction + other.friction) / 2
+            watched = one.watched or other.watched
+            _add_contact(spec, one.name, other.name, friction, watched=watched)
 
 
-def _look_ahead(pair: Any) -> None:
-    """Report a contact from a distance on; a force acts from the overlap on, as without this."""
-    pair.gap = TOUCH_MARGIN_M
-
-
-def _add_contact(spec: Any, one: str, other: str, friction: float) -> Any:
+def _add_contact(spec: Any, one: str, other: str, friction: float, *, watched: bool) -> None:
     pair = spec.add_pair(geomname1=one, geomname2=other)
     pair.condim = CONTACT_DIMENSIONS
     pair.friction[:2] = max(friction, LEAST_FRICTION)
     pair.solref = [CONTACT_TIME_CONSTANT_S, CONTACT_DAMPING_RATIO]
     pair.solimp = CONTACT_IMPEDANCE
-    return pair
+    if watched:  # reported from a distance on; a force acts from the overlap on all the same
+        pair.gap = TOUCH_MARGIN_M
 
 
 def _touches_of(
